@@ -65,9 +65,8 @@ def test_a_low_sun_behind_the_bar(link: tuple[str, ...]) -> None:
 def test_motion_feedback_helps() -> None:
     """Motion that is left where regions are not followed well costs bits: half of them and more come back."""
     cut = ("motion.distance_m=90.0", "motion.vib_rate_rad_s=0.24", "duration_s=0.3")
-    soft, feedback = (
-        received("fast-drive", (6, 10), cut, (f"decoding.id={id}",)) for id in ("ml-soft", "motion-feedback")
-    )
+    links = (("decoding.id=ml-soft",), ("decoding.id=motion-feedback",))
+    soft, feedback = (received("fast-drive", (6, 10), cut, link) for link in links)
     assert soft.bit_errors >= 10
     assert feedback.bit_errors <= 0.5 * soft.bit_errors
 

@@ -24,9 +24,8 @@ ENU = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 def poses(truth: dict[str, Any], bars: np.ndarray, focal_px: float) -> tuple[np.ndarray, list[Attitude]]:
     """Places, m, float64 (n, 3), and attitudes of a camera on the scene's axis that sees the bars there."""
     camera, places, attitudes = truth["camera"], [], []
-    for depth, (x, y) in zip(
-        np.transpose(truth["distance_m"]), np.transpose(truth["bar_centre_px"], (2, 1, 0)), strict=True
-    ):
+    centres = np.transpose(truth["bar_centre_px"], (2, 1, 0))
+    for depth, (x, y) in zip(np.transpose(truth["distance_m"]), centres, strict=True):
         seen = np.stack([(x - camera["cx"]) / focal_px, (y - camera["cy"]) / focal_px, np.ones(2)], 1)
         seen *= depth[:, None]
         ahead = bars[:, 2] - np.sqrt((seen**2).sum(1) - bars[:, 0] ** 2 - bars[:, 1] ** 2)

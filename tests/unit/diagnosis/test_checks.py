@@ -291,12 +291,8 @@ def test_a_sensor_that_comes_to_each_row_too_late(rows: int, rests: bool) -> Non
 def test_a_readout_at_its_limit() -> None:
     """3000 events in each millisecond, against 3000 on average, and a lamp that blinks evenly."""
     rng = np.random.default_rng(4)
-    for many, capped in (
-        (np.full(300, 3000), True),
-        (rng.poisson(3000, 300), False),
-        (rng.poisson(20, 300), False),
-        (np.full(300, 20), False),
-    ):
+    others = rng.poisson(3000, 300), rng.poisson(20, 300), np.full(300, 20)
+    for many, capped in ((np.full(300, 3000), True), *((other, False) for other in others)):
         t_us = np.sort(np.concatenate([1000 * i + rng.integers(0, 1000, n) for i, n in enumerate(many)]))
         found = find(Facts(LINK, NOTHING, {}, 0.0, 3e5, readout=readout_of(t_us)))
         assert [doubt.code for doubt in found] == ["saturated"] * capped
@@ -310,9 +306,8 @@ def test_events_of_each_millisecond(steps: list[int], pieces: int) -> None:
     many = np.unique(t_us // 1000, return_counts=True)[1][:-1]
     share, most = readout_of(t_us, 0, pieces).events.capped()
     assert most == pytest.approx(many.max(initial=0), rel=0.004)
-    assert share == pytest.approx(
-        (many == many.max()).mean() if len(many) else 0.0, abs=0 if most < 100 else 1
-    )
+    if most < 100:
+        assert share == pytest.approx((many == many.max()).mean() if len(many) else 0.0)
 
 
 def learnt(part: str, what: str, off: float, sigma: float) -> dict[str, Any]:

@@ -76,12 +76,8 @@ def test_what_is_wrong_is_named(code: str, changes: dict[str, Any], sent: tuple[
     assert diagnosis.headline
 
 
-MESSAGES = {
-    "bars.0.payload": "messages",
-    "world.latitude_deg": 35.1,
-    "world.longitude_deg": 137.0,
-    "world.height_m": 50.0,
-}
+MESSAGES = {"bars.0.payload": "messages"}
+MESSAGES |= {"world.latitude_deg": 35.1, "world.longitude_deg": 137.0, "world.height_m": 50.0}
 WH8, REED_SOLOMON = ("modulation.id=wh8",), ("error-correction.id=reed-solomon",)
 
 

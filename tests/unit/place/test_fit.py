@@ -125,17 +125,15 @@ def test_equations_are_those_of_numerical_slopes() -> None:
     _, matrix, side = whole(p, found)
     scale = np.sqrt(np.diag(slope.T @ slope))
     # The roll is about the level forward axis, not the pitched one.
-    np.testing.assert_allclose(
-        matrix / scale / scale[:, None], (slope / scale).T @ (slope / scale), atol=1e-3
-    )
+    even = slope / scale
+    np.testing.assert_allclose(matrix / scale / scale[:, None], even.T @ even, atol=1e-3)
     np.testing.assert_allclose(side / scale, slope.T @ at_rest / scale, atol=2e-3)
     # Without the bars' own, the step is that of all.
     shared = np.zeros(14)
     shared[p.free] = np.linalg.solve(*found.normal)
     step, free = np.append(shared, (found.moved(shared).local - at.local).ravel()), free_of(p)
-    np.testing.assert_allclose(
-        (matrix @ step / scale)[free], (side / scale)[free], atol=1e-6 * np.abs(side / scale).max()
-    )
+    most = 1e-6 * np.abs(side / scale).max()
+    np.testing.assert_allclose((matrix @ step / scale)[free], (side / scale)[free], atol=most)
     assert found.cost == pytest.approx(at_rest @ at_rest, rel=1e-6)
     behind = dataclasses.replace(at, position=position + rotation @ np.array([0, 0, 100.0]))
     assert linearize(p, behind) is None

@@ -41,10 +41,8 @@ def mixed() -> list[tuple[float, str]]:
 
 
 def drive(rng: np.random.Generator) -> list[Fix]:
-    return [
-        fix_of(t, np.array([3.0, 20.0, 0.1]) * t + 0.3 * SIGMA_M[source] * rng.normal(size=3), source)
-        for t, source in mixed()
-    ]
+    speed, off = np.array([3.0, 20.0, 0.1]), 0.3 * rng.normal(size=(len(mixed()), 3))
+    return [fix_of(t, speed * t + SIGMA_M[by] * o, by) for (t, by), o in zip(mixed(), off, strict=True)]
 
 
 def process(seen: list[tuple[float, str]], axis: int) -> tuple[Floats, Floats]:
@@ -179,9 +177,7 @@ def test_a_place_with_its_sigmas(tmp_path: Path) -> None:
     assert log.t_us.tolist() == [(5 * 3600 + 28 * 60 + 14) * 1e6]
     np.testing.assert_allclose(log.place[0], [37.391097951, -122.037826311, -6.776], atol=1e-8)
     np.testing.assert_allclose(np.sqrt(np.diag(log.covariance_m2[0])), [0.020, 0.023, 0.031])
-
-
-def test_an_ellipse_is_that_of_the_covariance(tmp_path: Path) -> None:
+    # An ellipse is that of the covariance.
     covariance = np.array([[4.0, -1.5, 0.0], [-1.5, 1.0, 0.0], [0.0, 0.0, 9.0]])
     told = gst(clock_of(0.0, NOON), 1.0, covariance).strip()
     found = read_nmea(write(tmp_path, told, at("120000.00")), NOON, 0.0)

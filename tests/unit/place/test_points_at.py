@@ -127,11 +127,8 @@ def test_a_layouts_own_form_and_its_perspective_are_no_errors(shape: str) -> Non
     exact = seen_as(layout_m, 0.0, 0)
     assert exact.across * exact.sigma_px.mean() < 0.003
     # What stands over all frames does not scatter, and is shown.
-    squares = [
-        (found.across * found.sigma_px.mean()) ** 2
-        for seed in range(200)
-        for found in [seen_as(layout_m, 0.05, seed)]
-    ]
+    bars = [seen_as(layout_m, 0.05, seed) for seed in range(200)]
+    squares = [(found.across * found.sigma_px.mean()) ** 2 for found in bars]
     assert 1.2 < np.mean(squares) / 0.05**2 < 2.2
 
 
@@ -182,9 +179,8 @@ def test_a_gap_beside_a_fix_is_known_by_how_far_a_polynomial_may_be_off() -> Non
 
 BENT = CameraModel(focal_mm=8.0, k1=-0.2, k2=0.05, p1=1e-3, p2=-1e-3, centre_x_px=650.0, centre_y_px=350.0)
 LENS = CameraSigma(0.04, 2.0, 2.0, 0.01, 0.01, 1e-4, 1e-4)
-STRETCHED = ErrorModel(
-    shaken_sigma_px=0.1, shared_sigma_px=0.03**0.5, shared_share=0.002, stretch_share=0.004
-)
+STRETCHED = replace(POINTS_ONLY, shaken_sigma_px=0.1, shared_sigma_px=0.17320508, shared_share=0.002)
+STRETCHED = replace(STRETCHED, shared_along_px=ErrorModel.shared_along_px, stretch_share=0.004)
 SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
 
 
@@ -203,6 +199,9 @@ def test_the_point_is_the_one_that_is_seen() -> None:
     exact = bar_point(ranged(x, y, 40.0, 0.1), 0.96, BENT, spec=spec)
     stretched = 0.1**2 + (40 * 0.001) ** 2
     np.testing.assert_allclose(exact.covariance_m2, stretched * np.outer(along, along), atol=1e-9)
+    # Without a distance, or its sigma, there is none.
+    for distance_m in (math.nan, 40.0):
+        assert bar_point(ranged(x, y, distance_m, math.nan), 0.96, BENT) is None
 
 
 def test_what_bends_a_bar_stays_over_frames() -> None:
@@ -235,8 +234,3 @@ def test_every_error_is_in_its_covariance() -> None:
         squares.append(square(found.point_m - true, found.covariance_m2))
     assert by_chance(squares, 3, 0.999)
     assert np.linalg.eigvalsh(found.covariance_m2 - found.standing @ found.standing.T)[0] > 0
-
-
-@pytest.mark.parametrize(("distance_m", "sigma_m"), [(math.nan, math.nan), (40.0, math.nan)])
-def test_a_frame_without_a_distance_has_none(distance_m: float, sigma_m: float) -> None:
-    assert bar_point(ranged(640.0, 360.0, distance_m, sigma_m), 0.96, BENT) is None

@@ -358,10 +358,8 @@ def test_protection_levels_cover_what_no_test_finds() -> None:
 def test_two_bars_that_may_be_mixed_up_are_protected_as_far_as_behind_them() -> None:
     """On gravity alone, two that stand alike fit from behind, too, each at the other's site: 100 m away."""
     rng, spec = np.random.default_rng(19), ErrorModel(bar_fault_m=0.5)
-    other, seen = (
-        views([bar(POLES[0]), bar(place)], np.zeros(3), UP.rotation(), rng, 0.1)
-        for place in ((4.0, 46.0, 5.5), POLES[1])
-    )
+    both = [bar(POLES[0]), bar((4.0, 46.0, 5.5))], [bar(place) for place in POLES]
+    other, seen = (views(bars, np.zeros(3), UP.rotation(), rng, 0.1) for bars in both)
     assert math.isfinite(solved(solve_pose(other, CAMERA, GRAVITY, spec)).hpl_m)
     pose = solved(solve_pose(seen, CAMERA, GRAVITY, spec))
     assert math.isinf(pose.hpl_m)

@@ -155,10 +155,7 @@ def test_one_bar_gives_a_fix_a_packet_time() -> None:
 def test_two_bars_of_other_phases_give_the_heading() -> None:
     turned = Attitude(4.0, 1.0, 359.0, 0.0, 0.0)
     p = positioner([LEFT, RIGHT], Attitude(4.0, 1.0, None, 0.0))
-    left, right = (
-        packets_of(bar, number, 8, start_us, attitude=turned)
-        for bar, number, start_us in ((LEFT, 0, 5000.0), (RIGHT, 1, 21_000.0))
-    )
+    left, right = packets_of(LEFT, 0, 8, attitude=turned), packets_of(RIGHT, 1, 8, 21_000.0, attitude=turned)
     fixes = fixes_of(p, merged(left, right))
     both = [f for f in fixes if f.transmitters == (0, 1) and not f.refusal]
     assert len(both) >= 6
@@ -262,21 +259,16 @@ def test_which_beacons_are_believed(beacons, messages, known) -> None:
         assert (found is None) == (mark == "-")
         if found is not None:
             assert registry.verified(0) == (mark == "+")
-            assert ORIGIN.to_enu(found.latitude_deg, found.longitude_deg, found.height_m) == pytest.approx(
-                [2.0, -6.0, 0.0], abs=0.01
-            )
+            place = ORIGIN.to_enu(found.latitude_deg, found.longitude_deg, found.height_m)
+            assert place == pytest.approx([2.0, -6.0, 0.0], abs=0.01)
 
 
 def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
     """From behind two bars the image of swapped ones is the same; what they say of themselves tells."""
     gravity = Attitude(4.0, 1.0, None, 0.0, 0.0)
     swapped = [dataclasses.replace(LEFT, transmitter_id=9), dataclasses.replace(RIGHT, transmitter_id=7)]
-    stream = merged(
-        *(
-            packets_of(bar, n, 6, messages={0: (heard(bar, "unverified", 0),)})
-            for n, bar in enumerate((LEFT, RIGHT))
-        )
-    )
+    told = [{0: (heard(bar, "unverified", 0),)} for bar in (LEFT, RIGHT)]
+    stream = merged(packets_of(LEFT, 0, 6, messages=told[0]), packets_of(RIGHT, 1, 6, messages=told[1]))
     right = positioner([LEFT, RIGHT], gravity)
     assert_right(fixes_of(right, stream))
     assert right.bars.contradicted == {}

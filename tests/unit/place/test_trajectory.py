@@ -154,10 +154,8 @@ def test_a_car_that_turns_stays_on_its_track(rate_deg_s: float) -> None:
 
 def test_a_bar_long_out_of_sight_is_forgotten() -> None:
     """The states of a drive past many bars stay few; what is left is the dense problem without the rest."""
-    fixes = [
-        fix(i * 1e6, np.array([float(i), 0, 0]), NOISE_M2, standing={f"bar {i // 5}": 0.1 * np.eye(3)})
-        for i in range(200)
-    ]
+    bars = [{f"bar {i // 5}": 0.1 * np.eye(3)} for i in range(200)]
+    fixes = [fix(i * 1e6, np.array([i, 0.0, 0.0]), NOISE_M2, standing=one) for i, one in enumerate(bars)]
     points = filter_fixes(fixes, SPEC)
     assert max(len(p.mean) for p in points) <= 9 + 3 * 4
     smooth = smooth_trajectory(points, SPEC)
@@ -434,10 +432,8 @@ def test_what_a_drive_does_not_tell_keeps_its_sigma() -> None:
     rows = estimate_biases(states_of(points[-1]), CAMERA, LENS, Attitude(0, 0, 0, 0.2, 0.3), {}, BIASED)
     found = {(row.part, row.what): row for row in rows}
     # Nothing was stated of the clock, nor of the principal point, nor of the site.
-    assert list(found) == [
-        ("camera", "focal_mm"),
-        *(("attitude", name) for name in ("pitch_deg", "roll_deg", "heading_deg")),
-    ]
+    angles = [("attitude", name) for name in ("pitch_deg", "roll_deg", "heading_deg")]
+    assert list(found) == [("camera", "focal_mm"), *angles]
     for row in rows:
         assert not row.determined
         assert row.sigma == pytest.approx(row.stated_sigma)

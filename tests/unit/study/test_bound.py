@@ -201,6 +201,13 @@ def test_a_bar_has_nearly_the_bound_of_its_boundaries() -> None:
     wanted = bar_bound(link, 50.0, range(16), blur_px=0.45, noise=0.3, columns=2)
     assert found.distance_m == pytest.approx(wanted, rel=0.1)
     assert math.isinf(found.swing_deg)
+    # What nothing says is infinite.
+    one = layout_bound(load_link(overrides=["bar.shape=table"]), 50.0, [3], blur_px=0.45, noise=0.3)
+    assert one.x_px == pytest.approx(one.y_px)
+    assert one.x_px < 0.2
+    assert one.distance_m > 1000
+    assert math.isinf(one.turn_deg)
+    assert math.isinf(one.lean_deg)
 
 
 def test_a_fit_of_drawn_images_scatters_as_the_bound_says() -> None:
@@ -223,12 +230,3 @@ def test_a_fit_of_drawn_images_scatters_as_the_bound_says() -> None:
     bound = np.sqrt(np.diag(np.linalg.inv(slopes @ slopes.T / 0.05**2)))
     # 48 squares of normal numbers tell their mean to 20 %.
     assert np.mean(((np.array(fits) - true) / bound)[:, :4] ** 2) == pytest.approx(1, abs=0.6)
-
-
-def test_what_nothing_says_is_infinite() -> None:
-    one = layout_bound(load_link(overrides=["bar.shape=table"]), 50.0, [3], blur_px=0.45, noise=0.3)
-    assert one.x_px == pytest.approx(one.y_px)
-    assert one.x_px < 0.2
-    assert one.distance_m > 1000
-    assert math.isinf(one.turn_deg)
-    assert math.isinf(one.lean_deg)

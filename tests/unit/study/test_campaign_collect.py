@@ -174,11 +174,9 @@ def test_what_is_no_store_or_cannot_be_opened_is_refused(tmp_path: Path) -> None
         Store(tmp_path / "none.sqlite")
     with pytest.raises(OutputError, match=r"a\.sqlite: cannot be written: unable to open"):
         Store(tmp_path / "no" / "such" / "a.sqlite", create=True)
-    with (
-        Store(tmp_path / "new.sqlite", create=True) as store,
-        pytest.raises(InputError, match="no campaign has started"),
-    ):
-        store.plan()
+    new = Store(tmp_path / "new.sqlite", create=True)
+    with new, pytest.raises(InputError, match="no campaign has started"):
+        new.plan()
 
 
 class Cluster:

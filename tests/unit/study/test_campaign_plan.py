@@ -56,10 +56,7 @@ def test_a_grid_with_variants(tmp_path: Path) -> None:
     assert base == str(tmp_path / "night.toml")
     assert overrides == ("sensor.noise_ln=0.02", "speed_kmh=20", "distance_m=60.0")
     assert plan.links[1].value == (None, ("ranging.clusters=[1, 14]", "ranging.drop_extremes=0"))
-
-
-def test_jobs_go_seed_by_seed_and_share_a_scene_among_links(tmp_path: Path) -> None:
-    plan = plan_of(tmp_path)
+    # Jobs go seed by seed, and share a scene among links.
     assert [job.seed for job in plan.jobs] == [10] * 6 + [11] * 6 + [12] * 6
     assert all(len(job.tasks) == 2 for job in plan.jobs)
     ids = [task.id for job in plan.jobs for task in job.tasks]

@@ -55,11 +55,8 @@ def plain(table: Table) -> Table:
     return json.loads(json.dumps(table))
 
 
-COVERS = {
-    "covered": [4, 5, 12],
-    "cover_s": [[0.03, 0.06, 10, 15], [0.05, 0.052, 0, 3], [0.0, 0.3, 9, 9]],
-    "pole_s": [[0.08, 0.1], [0.15, 0.1515]],
-}
+COVERS = {"covered": [4, 5, 12], "pole_s": [[0.08, 0.1], [0.15, 0.1515]]}
+COVERS |= {"cover_s": [[0.03, 0.06, 10, 15], [0.05, 0.052, 0, 3], [0.0, 0.3, 9, 9]]}
 
 
 def scene_truths() -> dict[str, Table]:
@@ -294,10 +291,8 @@ def seen(truth: Truth) -> list[Packet]:
             shown = frame(points, 0.1, at, number, f // 10, f % 10)
             x_px, y_px = points.mean(0).tolist()
             frames.append(replace(shown, t_us=at - 800, x_px=x_px, y_px=y_px))
-        packets += [
-            Packet(number, p, frames[10 * p].t_us - 2600, 100.0, tuple(frames[10 * p : 10 * p + 10]), 10)
-            for p in range(3)
-        ]
+        parts = [tuple(frames[at : at + 10]) for at in (0, 10, 20)]
+        packets += [Packet(number, p, of[0].t_us - 2600, 100.0, of, 10) for p, of in enumerate(parts)]
     return sorted(packets, key=lambda packet: packet.t_us)
 
 

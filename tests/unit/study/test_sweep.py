@@ -129,9 +129,7 @@ def test_the_shipped_campaigns_are_read() -> None:
     # The guesses are set in one way wherever the paper's drive is simulated.
     guesses = {json.dumps([s.identity["sensor"], s.identity["lens"]]) for s in [*demo.scenes, *paper.scenes]}
     assert len(guesses) == 1
-
-
-def test_a_road_is_swept_in_steps_by_the_default_link_and_the_papers() -> None:
+    # A road is swept in steps, by the default link and the paper's.
     plan = plan_of(ROOT / "examples" / "campaigns" / "road.toml")
     assert [link.labels["variant"] for link in plan.links] == ["default", "paper"]
     assert plan.links[0].identity["digest"] == resolve({}).digest

@@ -29,13 +29,9 @@ STATISTICS = st.builds(
 
 
 @given(STATISTICS, STATISTICS, STATISTICS)
-def test_sums_do_not_depend_on_order(a: Statistics, b: Statistics, c: Statistics) -> None:
+def test_sums_do_not_depend_on_order_and_json_keeps_them(a: Statistics, b: Statistics, c: Statistics) -> None:
     assert (a + b) + c == a + (b + c) == c + b + a
     assert a + Statistics() == a
-
-
-@given(STATISTICS)
-def test_json_keeps_them(a: Statistics) -> None:
     assert Statistics.from_dict(json.loads(json.dumps(a.to_dict()))) == a
 
 
@@ -77,13 +73,8 @@ def test_positions_have_quantiles() -> None:
 
 
 def test_what_is_silent_and_not_covered_is_counted() -> None:
-    kinds = {
-        14.1: "",
-        14.2: "",
-        98.0: "protected",
-        99.0: "protected beyond excluded",
-        1.0: "protected beyond",
-    }
+    kinds = {14.1: "", 14.2: "", 1.0: "protected beyond"}
+    kinds |= {98.0: "protected", 99.0: "protected beyond excluded"}
     fixes = (Tally.fix(0.1, nees, **dict.fromkeys(kind.split(), True)) for nees, kind in kinds.items())
     total = sum(fixes, Tally(fixes_refused=9))
     assert (total.fixes, total.fixes_silent, total.fixes_uncovered) == (5, 3, 2)
