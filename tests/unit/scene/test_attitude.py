@@ -8,26 +8,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
+from tests.unit.mutants import refusal
 
 Floats = NDArray[np.float64]
 T_S = np.arange(0, 4, 0.005)
+GRAVITY = np.array([0.0, 0.0, 9.80665])
 
 
 def moving_log() -> AttitudeLog:
     """Pitched and rolled, turning at a rate that changes, on a circle in the end."""
-    pitch, roll = np.full(len(T_S), 7.0), np.full(len(T_S), -12.0)
-    heading = heading_deg(T_S)
-    rates, forces = np.empty((len(T_S), 3)), np.empty((len(T_S), 3))
-    for i, t in enumerate(T_S):
-        axes = Attitude(7.0, -12.0, heading[i]).rotation()
-        # Clockwise as seen from above: downward, right-handed.
-        turn = (heading_deg(t + 1e-4) - heading_deg(t - 1e-4)) / 2e-4
-        rates[i] = axes.T @ [0.0, 0.0, -turn]
-        forces[i] = axes.T @ (pushed_enu(t) + np.array([0.0, 0.0, 9.80665]))
-    still = np.zeros(len(T_S))
-    return AttitudeLog(T_S * 1e6, pitch, roll, None, still, still, rates_deg_s=rates, forces_m_s2=forces)
+    axes = [Attitude(7.0, -12.0, heading).rotation() for heading in heading_deg(T_S)]
+    # Clockwise as seen from above: downward, right-handed.
+    turns = (heading_deg(T_S + 1e-4) - heading_deg(T_S - 1e-4)) / 2e-4
+    rates = [at.T @ [0.0, 0.0, -turn] for at, turn in zip(axes, turns, strict=True)]
+    forces = [at.T @ (pushed_enu(t) + GRAVITY) for at, t in zip(axes, T_S, strict=True)]
+    still = 0 * T_S
+    angles = T_S * 1e6, still + 7.0, still - 12.0, None, still, still
+    return AttitudeLog(*angles, rates_deg_s=np.array(rates), forces_m_s2=np.array(forces))
 
 
 def heading_deg(t: Floats | float) -> Floats:
@@ -105,11 +103,8 @@ def test_lines_that_cannot_be_are_told(tmp_path: Path, columns: str, values: str
     path = tmp_path / "imu.csv"
     first = values.replace("95", "0").replace("1e17", "0")
     path.write_text(f"{ANGLES}{columns}\n0,{first}\n1000,{values}\n")
-    if says is None:
-        assert AttitudeLog.read(path).forces_m_s2 is not None
-        return
-    with pytest.raises(EvlcpError, match=re.escape(says)):
-        AttitudeLog.read(path)
+    said = refusal(lambda: AttitudeLog.read(path))
+    assert said is None if says is None else says in str(said)
 
 
 def test_angles_are_not_drawn_across_lines_that_are_lost() -> None:
@@ -128,15 +123,14 @@ def test_angles_are_not_drawn_across_lines_that_are_lost() -> None:
         swing = log.between(start_us, end_us)
         assert swing.turn_rad[-1] == pytest.approx(np.radians((end_us - start_us) * 1e-3))
     # Lines that come late, but not by much, and logs of few lines have no gaps.
-    late = AttitudeLog(np.array([0.0, 1e3, 2e3, 9e3, 10e3]), *(np.zeros(5),) * 2, None, *(np.zeros(5),) * 2)
-    assert late.at(5e3) is not None
-    two = AttitudeLog(np.array([0.0, 1e9]), *(np.zeros(2),) * 2, None, *(np.zeros(2),) * 2)
-    assert two.at(5e8) is not None
+    for t_us in ([0.0, 1e3, 2e3, 9e3, 10e3], [0.0, 10e3]):
+        none = np.zeros(len(t_us))
+        assert AttitudeLog(np.array(t_us), none, none, None, none, none).at(5e3) is not None
 
 
 TURN_S = np.arange(0, 6, 0.01)
 NOISE = np.random.default_rng(1).normal(0, 1.0, len(TURN_S))
-CIRCLE = 350 + 45 * TURN_S + 0.5 * NOISE, np.full(len(TURN_S), 45.0)
+CIRCLE = 350 + 45 * TURN_S + 0.5 * NOISE, 0 * TURN_S + 45.0
 CURVES = 10 * np.sin(2 * TURN_S) + 0.5 * NOISE, 20 * np.cos(2 * TURN_S)
 
 
@@ -159,10 +153,6 @@ def test_rates_of_another_measure_or_sign_are_told(tmp_path, heading_deg, rate_d
     columns = zip(TURN_S * 1e6, heading_deg % 360, rate_deg_s, strict=True)
     lines = [f"{ANGLES},heading_deg,{RATES}", *(f"{t:.0f},0,0,{h:.6f},0,{r:.6f},0" for t, h, r in columns)]
     (tmp_path / "imu.csv").write_text("\n".join(lines))
-    if times is None:
-        AttitudeLog.read(tmp_path / "imu.csv")
-        return
-    with pytest.raises(ConfigError) as caught:
-        AttitudeLog.read(tmp_path / "imu.csv")
-    told = re.search(r"rates turn the camera (\S+) times as far as its headings do", str(caught.value))
-    assert float(told[1]) == pytest.approx(times, rel=0.1)
+    said = refusal(lambda: AttitudeLog.read(tmp_path / "imu.csv"))
+    told = re.search(r"rates turn the camera (\S+) times as far as its headings do", said or "")
+    assert (told and float(told[1])) == (times and pytest.approx(times, rel=0.1))

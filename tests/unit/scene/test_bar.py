@@ -50,23 +50,16 @@ def test_clusters_of_a_table_have_any_size() -> None:
 
 
 def test_an_even_column_is_known_however_it_is_described() -> None:
-    column = [[0, 0.06 * (i // 6) + 0.01 * (i % 6), 0, i // 6] for i in range(24)]
-    pitch = [
-        BarLayout(),
-        BarLayout(LedColumns(columns=1)),
-        BarLayout(LedTable(tuple((0.0, y, 0.0, k) for _, y, _, k in column))),
-    ]
-    assert [round(bar.column_pitch_m, 9) for bar in pitch] == [0.06] * 3
-    others = [
-        BarLayout(LedColumns()),
-        BarLayout(LedRing()),
-        BarLayout(LedGrid(rows=1, columns=6, cluster_rows=1)),
-        BarLayout(LedGrid(rows=6)),
-        BarLayout(LedTable(((0, 0, 0, 0), (0, 1, 0, 1), (0, 3, 0, 2)))),
-        BarLayout(LedTable(((0, 0, 0, 2), (0, 1, 0, 1), (0, 2, 0, 0)))),
-        BarLayout(LedTable(((0, 0, 0, 0), (0, 1, 0.1, 1), (0, 2, 0, 2)))),
-    ]
-    assert all(math.isnan(bar.column_pitch_m) for bar in others)
+    column = tuple((0.0, 0.06 * (i // 6) + 0.01 * (i % 6), 0.0, i // 6) for i in range(24))
+    for leds in (LedGrid(), LedColumns(columns=1), LedTable(column)):
+        assert BarLayout(leds).column_pitch_m == pytest.approx(0.06)
+    for other in (
+        *(LedColumns(), LedRing(), LedGrid(rows=1, columns=6, cluster_rows=1), LedGrid(rows=6)),
+        LedTable(((0, 0, 0, 0), (0, 1, 0, 1), (0, 3, 0, 2))),
+        LedTable(((0, 0, 0, 2), (0, 1, 0, 1), (0, 2, 0, 0))),
+        LedTable(((0, 0, 0, 0), (0, 1, 0.1, 1), (0, 2, 0, 2))),
+    ):
+        assert math.isnan(BarLayout(other).column_pitch_m)
 
 
 @pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)
@@ -99,9 +92,8 @@ def test_sides_say_where_light_goes_on() -> None:
 def test_even_columns_are_found_in_any_order() -> None:
     assert [(ids.tolist(), m) for ids, m in BarLayout().even_columns] == [(list(range(16)), 0.06)]
     # Two columns upside down beside a lone LED, and one whose steps are not even.
-    leds = [
-        [x, y, 0.0, k] for k, (x, y) in enumerate([(0, 2), (1, 4), (0, 1), (1, 2), (0, 0), (1, 0), (2, 0)])
-    ]
+    places = [(0, 2), (1, 4), (0, 1), (1, 2), (0, 0), (1, 0), (2, 0)]
+    leds = [[x, y, 0.0, k] for k, (x, y) in enumerate(places)]
     layout = BarLayout.of_table({"shape": "table", "leds": leds})
     assert [(ids.tolist(), m) for ids, m in layout.even_columns] == [([4, 2, 0], 1.0), ([5, 3, 1], 2.0)]
     leds[0][1] = 2.5
@@ -144,6 +136,9 @@ def test_a_fault_of_a_csv_file_is_one_line(text: str, said: str, tmp_path: Path)
     assert str(fault.value) == f"{tmp_path / 'link.toml'}: bar.leds_file: {tmp_path / 'leds.csv'}: {said}"
 
 
+LEDS_BEHIND = [[0, 0, 0, 0], [0.1, 0, 0, 1], [0, 0, 0.3, 2]]
+
+
 @pytest.mark.parametrize(
     ("bar", "said"),
     [
@@ -154,10 +149,7 @@ def test_a_fault_of_a_csv_file_is_one_line(text: str, said: str, tmp_path: Path)
         ({"shape": 3}, "link.toml: bar.shape = 3: expected one of grid, columns, ring, table"),
         ({"shape": "table", "leds": []}, "bar.leds: 0 LEDs: expected at most 65536 LEDs, and one at least"),
         ({"shape": "table", "leds": [[0, 0, 0, 1]]}, "bar.leds: no LED of cluster 0: expected clusters 0"),
-        (
-            {"shape": "table", "leds": [[0, 0, 0, 0], [0.1, 0, 0, 1], [0, 0, 0.3, 2]]},
-            "bar.leds: cluster 2 is behind cluster 0, LED by LED: expected clusters that a camera in front",
-        ),
+        ({"shape": "table", "leds": LEDS_BEHIND}, "bar.leds: cluster 2 is behind cluster 0, LED by LED: exp"),
         ({"shape": "table", "leds": [[0, 0, 0, 0], [1e-8, 0, 0, 1]]}, "bar.leds.1: stands where bar.leds.0"),
     ],
 )
