@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -93,8 +94,8 @@ def test_sigmas_and_correlations_make_the_covariance() -> None:
     rng = np.random.default_rng(4)
     half = rng.normal(size=(7, 7))
     covariance = half @ half.T
-    sigma = np.sqrt(np.diag(covariance)) * [1e-2, 1, 1, 1e-2, 1e-2, 1e-4, 1e-4]
-    rows = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    roots = np.sqrt(np.diag(covariance))
+    sigma, rows = roots * [1e-2, 1, 1, 1e-2, 1e-2, 1e-4, 1e-4], covariance / np.outer(roots, roots)
     found = CameraSigma(*sigma.tolist(), correlation=tuple(tuple(r) for r in rows.tolist()))
     root = found.root(BENT)
     assert not np.triu(root, 1).any()
@@ -107,16 +108,16 @@ def test_sigmas_and_correlations_make_the_covariance() -> None:
 @pytest.mark.parametrize(
     ("rows", "says"),
     [
-        (((1.0,),), "expected 7 rows of 7"),
-        (tuple((1.0,) * 7 for _ in range(6)), "expected 7 rows of 7"),
-        (tuple((2.0,) * 7 for _ in range(7)), "expected 1 on the diagonal"),
-        (tuple(tuple(1.0 if i <= j else 0.5 for j in range(7)) for i in range(7)), "the same on both sides"),
-        (tuple(tuple(1.0 if i == j else -0.9 for j in range(7)) for i in range(7)), "no direction of"),
+        (np.ones((1, 1)), "expected 7 rows of 7"),
+        (np.ones((6, 7)), "expected 7 rows of 7"),
+        (np.full((7, 7), 2.0), "expected 1 on the diagonal"),
+        (np.triu(np.ones((7, 7))), "the same on both sides"),
+        (1.9 * np.eye(7) - 0.9, "no direction of"),
     ],
 )
-def test_correlations_that_are_none_are_refused(rows: tuple[tuple[float, ...], ...], says: str) -> None:
+def test_correlations_that_are_none_are_refused(rows: NDArray[np.float64], says: str) -> None:
     with pytest.raises(ConfigError, match=f"camera_sigma.correlation: .*{says}"):
-        CameraSigma(focal_mm=1.0, correlation=rows)
+        CameraSigma(focal_mm=1.0, correlation=tuple(map(tuple, rows.tolist())))
 
 
 CAMERA = CameraModel()
@@ -152,10 +153,8 @@ def test_a_plumb_bar(pitch_deg, roll_deg, east, up, axis) -> None:
 
 
 def foreshortening(sine: float, along: float, across: float) -> float:
-    """As the receiver has it: by one sine that is all that is likely, the others none."""
-    sines, likely = np.array([sine, 0.5]), np.array([1.0, 0.0])
-    length, _ = _kernels.mean_length(sines, likely, math.nan, 1.0, along, across)
-    return float(length)
+    """As the receiver has it: by one sine that is all that is likely."""
+    return float(_kernels.mean_length(np.array([sine]), np.ones(1), math.nan, 1.0, along, across)[0])
 
 
 def test_a_lean_beside_the_middle_counts_at_once() -> None:
@@ -184,24 +183,22 @@ def test_the_sigma_is_that_of_gravity_and_of_plumb_bars() -> None:
     assert sight.sigma == pytest.approx(math.radians(math.hypot(0.2, 0.1)) * math.cos(math.radians(30)))
 
 
-CORNERS = [(-600.0, -320.0), (600.0, -320.0), (-600.0, 320.0), (600.0, 320.0)]
-
-
-@pytest.mark.parametrize("corner", CORNERS)
+@pytest.mark.parametrize("corner", list(product((-600.0, 600.0), (-320.0, 320.0))))
 @pytest.mark.parametrize("lens", [{"k1": -0.25}, {"k1": 0.3, "k2": -5.0}, {"p1": 0.01, "p2": -0.02}])
 @pytest.mark.parametrize("depth_m", [20.0, 45.0])
 def test_distances_and_bends_of_a_distorted_bar_are_those_of_a_pinhole(corner, lens, depth_m) -> None:
     """An even scale fitted to where boundaries are seen, as rangings do, by NumPy."""
     camera = CameraModel(**lens)
-    middle = np.array([*(np.array(corner) / CAMERA.focal_px * depth_m), depth_m])
+    middle = np.array([*corner, CAMERA.focal_px]) / CAMERA.focal_px * depth_m
     place = np.arange(1.0, 16.0) - 8
     down = np.array([0.05, 0.998, 0.0]) / np.hypot(0.05, 0.998)
-    boundaries = camera.project(middle + 0.06 * place[:, None] * down)
-    clusters = camera.project(middle + 0.06 * (np.arange(16.0) - 7.5)[:, None] * down)
+    boundaries, clusters = (
+        camera.project(middle + 0.06 * at[:, None] * down) for at in (place, np.arange(16.0) - 7.5)
+    )
     axis = clusters[-1] - clusters[0]
     shown = (boundaries - clusters.mean(0)) @ axis / np.hypot(*axis)
-    spacing_px, _ = np.polyfit(place, shown, 1)
-    off_px = shown - np.polyval(np.polyfit(place, shown, 1), place)
+    spacing_px, first_px = np.polyfit(place, shown, 1)
+    off_px = shown - spacing_px * place - first_px
     sight = sight_of(camera, clusters, SIGMA_PX)
     naive_m = camera.distance_m(0.06, spacing_px)
     assert abs(naive_m / depth_m - 1) > 4e-4
