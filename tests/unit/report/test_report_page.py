@@ -71,30 +71,27 @@ def reported(folder: Path, name: str = "a.raw", **summary: Any) -> Iterator[Repo
 
 def test_numbers_are_those_of_the_files(result: Path) -> None:
     page = (result / "report.html").read_text()
-    given = rows_of(result / "frames.csv")
+    given, told = rows_of(result / "frames.csv"), held(page)["plots"]
     assert len(given) == 21
     body = re.findall(r"<tr><td>(\d+)/(\d+)</td>(.*?)</tr>", page, re.DOTALL)
-    for row, (packet, frame, cells) in zip(given, body, strict=True):
+    dots = [text for _, _, text, _ in told["distance-0"]]
+    for row, (packet, frame, cells), dot in zip(given, body, dots, strict=True):
         values = re.findall(r"<td[^>]*>(.*?)</td>", cells)
         assert (packet, frame) == (row["packet"], row["frame"])
         assert values[3:] == row["symbols"].split()
         # Both are rounded from the same number, the file's to more places.
-        told = [float(one) for one in values[1].split(" ± ")]
-        assert told == pytest.approx([float(row["distance_m"]), float(row["distance_sigma_m"])], abs=0.0051)
-    told = held(page)["plots"]
-    for row, (_, _, text, _) in zip(given, told["distance-0"], strict=True):
-        assert f"{row['distance_m']} ± {row['distance_sigma_m']} m" in text
-        assert f"quality {row['quality']}" in text
-        assert f"packet {row['packet']}, frame {row['frame']}," in text
-    # Dots stand where their times are, to a thousandth of the chart.
-    x = np.array([x for x, *_ in told["quality"]])
-    t_us = np.array([float(row["t_us"]) for row in given])
-    assert x == pytest.approx(np.polyval(np.polyfit(t_us, x, 1), t_us), abs=1.1)
-    y = np.array([y for _, y, *_ in told["distance-0"]])
-    distance_m = np.array([float(row["distance_m"]) for row in given])
-    slope, above = np.polyfit(distance_m, y, 1)
-    assert slope < 0
-    assert y == pytest.approx(slope * distance_m + above, abs=1.1)
+        shown = [float(one) for one in values[1].split(" ± ")]
+        assert shown == pytest.approx([float(row["distance_m"]), float(row["distance_sigma_m"])], abs=0.0051)
+        assert f"{row['distance_m']} ± {row['distance_sigma_m']} m" in dot
+        assert f"quality {row['quality']}" in dot
+        assert f"packet {packet}, frame {frame}," in dot
+    # Dots stand where their times and distances are, to a thousandth of the chart.
+    for plot, axis, column, sign in (("quality", 0, "t_us", 1), ("distance-0", 1, "distance_m", -1)):
+        at = np.array([dot[axis] for dot in told[plot]])
+        value = np.array([float(row[column]) for row in given])
+        slope, first = np.polyfit(value, at, 1)
+        assert slope * sign > 0
+        assert at == pytest.approx(slope * value + first, abs=1.1)
     summary = json.loads((result / "summary.json").read_text())
     doubts = [one["text"] for one in (*summary["warnings"], *summary["notes"])]
     for text in (summary["result"], *doubts, summary["digest"]):
@@ -198,9 +195,9 @@ def test_the_map_shows_fixes_and_bars(tmp_path: Path) -> None:
     fixes = rows_of(tmp_path / "fixes.csv")
     assert summary["positions"]["fixes"] == len(fixes) == len(told["track"]) == len(told["map"]) - 1
     for fix, (_, _, text, _) in zip(fixes, told["track"], strict=True):
-        east, north, up = (float(value) for value in re.findall(r"± (\S+) m", text))
-        for shown, axis in ((east, "east"), (north, "north"), (up, "up")):
-            assert shown == pytest.approx(float(fix[f"sigma_{axis}_m"]), rel=0.051)
+        shown = [float(value) for value in re.findall(r"± (\S+) m", text)]
+        sigmas = [float(fix[f"sigma_{axis}_m"]) for axis in ("east", "north", "up")]
+        assert shown == pytest.approx(sigmas, rel=0.051)
     assert told["map"][-1][2].startswith("bar 0\neast 0.000 m\nnorth 0.000 m")
     assert {"height", "spread"} <= told.keys()
 
