@@ -2,14 +2,17 @@
 
 import socket
 import threading
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from evlcp_sdk.errors import OutputError
+from evlcp_sdk.errors import InputError, OutputError
 from evlcp_sdk.io import open_source, write_events
 from evlcp_sdk.live.sender import Sender
 from evlcp_sdk.values import Events, Triggers
@@ -25,28 +28,24 @@ def recording(tmp_path: Path) -> Path:
 
 def test_what_is_sent_is_received(recording: Path, tmp_path: Path) -> None:
     url = f"replay:{recording}?speed=20"
-    with open_source(url) as source, Sender(source, ("localhost", 0), tmp_path / "s") as sender:
-        got: list[tuple[Events, Triggers]] = []
 
-        def receive(url: str) -> None:
-            with open_source(url) as other:
-                assert (other.width, other.height, other.format) == (640, 480, "EVT3")
-                got.append(other.read())
+    def receive(url: str) -> tuple[Events, Triggers]:
+        with open_source(url) as other:
+            assert (other.width, other.height, other.format) == (640, 480, "EVT3")
+            return other.read()
 
+    with (
+        open_source(url) as source,
+        Sender(source, ("localhost", 0), tmp_path / "s") as sender,
+        ThreadPoolExecutor() as threads,
+    ):
         stalled = socket.create_connection(("localhost", sender.port))
-        threads = [
-            threading.Thread(target=receive, args=(url,))
-            for url in (f"tcp://localhost:{sender.port}", f"unix:{tmp_path / 's'}")
-        ]
-        for thread in threads:
-            thread.start()
+        urls = f"tcp://localhost:{sender.port}", f"unix:{tmp_path / 's'}"
+        got = threads.map(receive, urls)
         while sender.counts["listeners"] < 3:
             assert sender.wait(lambda: False)
         stalled.close()
         sender.run()
-        for thread in threads:
-            thread.join(10)
-    assert len(got) == 2
     for events, triggers in got:
         for column in ("t_us", "x", "y", "p"):
             assert (getattr(events, column) == getattr(EVENTS, column)).all()
@@ -68,13 +67,11 @@ def test_the_command(evlcp: Callable[..., Any], recording: Path, tmp_path: Path)
     got = []
 
     def receive() -> None:
-        while True:
-            try:
-                with open_source(f"unix:{tmp_path / 's'}") as source:
-                    got.append(len(source.read()[0]))
-                return
-            except Exception:
-                threading.Event().wait(0.02)
+        while not got:
+            # Until it listens.
+            with suppress(InputError), open_source(f"unix:{tmp_path / 's'}") as source:
+                got.append(len(source.read()[0]))
+            time.sleep(0.02)
 
     thread = threading.Thread(target=receive, daemon=True)
     thread.start()
