@@ -1,6 +1,6 @@
 """The use cases as library functions."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,11 @@ from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.run import convert, receive
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.values import Events, Triggers
+from evlcp_sdk.values import Events, Packet, Triggers
 
 
-def by_hand(path: Path) -> list[tuple[int, int, list[int]]]:
-    """(transmitter, packet, frames' numbers) by the plain loop, closed at its end."""
-    receiver = Receiver(load_link())
-    with RawSource(path) as source:
-        packets = [p for events in source.chunks() for p in receiver.feed(events)] + receiver.close()
+def numbers_of(packets: Iterable[Packet]) -> list[tuple[int, int, list[int]]]:
+    """(transmitter, packet, frames' numbers) of each."""
     return [(p.transmitter, p.packet, [f.frame for f in p.frames]) for p in packets]
 
 
@@ -46,8 +43,12 @@ def test_the_last_packet_comes_too_and_the_source_is_closed(demo_raw: Path) -> N
             super().close()
 
     reception = receive(Watched(demo_raw))
-    found = [(p.transmitter, p.packet, [f.frame for f in p.frames]) for p in reception]
-    assert found == by_hand(demo_raw)
+    found = numbers_of(reception)
+    # By the plain loop, closed at its end.
+    receiver = Receiver(load_link())
+    with RawSource(demo_raw) as source:
+        packets = [p for events in source.chunks() for p in receiver.feed(events)] + receiver.close()
+    assert found == numbers_of(packets)
     assert list(reception) == []
     assert reception.counts["packets"] == len(found)
     assert reception.losses == {}
@@ -69,31 +70,25 @@ def test_input_that_fails_gives_what_was_decoded_first(demo_raw: Path) -> None:
             raise InputError(f"{self.path}: the disk is gone")
 
     reception, packets = receive(Failing(demo_raw)), []
-
-    def read() -> None:
-        for packet in reception:
-            packets.append(packet)
-
     with pytest.raises(InputError, match="the disk is gone"):
-        read()
+        packets.extend(reception)
     assert sum(len(packet.frames) for packet in packets) == reception.counts["frames"] > 0
 
 
 def test_a_simulation_is_a_source_like_a_recording(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
-    settings = ["duration_s=0.05", "motion.distance_m=70"]
-    source = evlcp_sdk.simulate("night", seed=4, overrides=settings)
-    assert repr(source) == "SimulatedSource(night, 1 bar, 0.05 s, seed 4)"
-    events, triggers = source.read()
+    settings = "duration_s=0.05", "motion.distance_m=70"
+    first, source = (evlcp_sdk.simulate("night", seed=4, overrides=settings) for _ in range(2))
+    assert repr(first) == "SimulatedSource(night, 1 bar, 0.05 s, seed 4)"
+    events, triggers = first.read()
     assert len(triggers) == 0
-    assert source.counts["events"] == source.counts["simulated_events"] == len(events)
-    source = evlcp_sdk.simulate("night", seed=4, overrides=settings)
+    assert first.counts["events"] == first.counts["simulated_events"] == len(events)
     written = source.save(tmp_path / "a.raw")
     recorded = evlcp_sdk.read_events(tmp_path / "a.raw")
     for column in ("t_us", "x", "y", "p"):
         assert np.array_equal(getattr(events, column), getattr(recorded, column)), column
     assert written == (tmp_path / "a.raw", tmp_path / "a.truth.json")
-    done = evlcp("simulate", "--preset", "night", "--seed", 4, "-o", tmp_path / "b.raw",
-                 *(word for s in settings for word in ("--set", s)))  # fmt: skip
+    options = [word for setting in settings for word in ("--set", setting)]
+    done = evlcp("simulate", "--preset", "night", "--seed", 4, "-o", tmp_path / "b.raw", *options)
     assert done.code == 0
     assert written[0].read_bytes() == (tmp_path / "b.raw").read_bytes()
     assert written[1].read_text() == (tmp_path / "b.truth.json").read_text()
