@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.metadata import entry_points
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -19,17 +20,19 @@ def ranging(name: str, target: str = "nowhere:Nothing") -> Algorithm:
     return Algorithm("ranging", name, target, 1, "a test")
 
 
-def test_one_wrong_id_has_one_answer() -> None:
+@pytest.mark.parametrize(
+    ("role", "name", "says"),
+    [
+        ("ranging", "pco", "named 'pco'; did you mean 'poc'? (installed: centroid, poc)"),
+        ("ranging", "time-of-flight", "named 'time-of-flight' (installed: centroid, poc)"),
+        ("pilots", "wh", "named 'wh' (installed: none)"),
+    ],
+)
+def test_one_wrong_id_has_one_answer(role: str, name: str, says: str) -> None:
     registry = Registry(Brings(ranging("poc"), ranging("centroid")))
     with pytest.raises(UnknownAlgorithmError) as caught:
-        registry.find("ranging", "pco")
-    expected = "no ranging algorithm named 'pco'; did you mean 'poc'? (installed: centroid, poc)"
-    assert str(caught.value) == expected
-    with pytest.raises(UnknownAlgorithmError) as far:
-        registry.find("ranging", "time-of-flight")
-    assert str(far.value) == "no ranging algorithm named 'time-of-flight' (installed: centroid, poc)"
-    with pytest.raises(UnknownAlgorithmError, match=r"no pilots algorithm named 'wh' \(installed: none\)"):
-        registry.find("pilots", "wh")
+        registry.find(role, name)
+    assert str(caught.value) == f"no {role} algorithm {says}"
 
 
 class Owner(NamedTuple):
@@ -52,18 +55,14 @@ def install(
 
 
 def test_two_algorithms_with_one_name_are_told_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    ours = Brings(ranging("poc"), ranging("centroid"))
-    install(
-        monkeypatch, ("a", "evlcp-sdk", lambda: ours), ("b", "evlcp-fast", lambda: Brings(ranging("poc")))
-    )
+    both = {"evlcp-sdk": Brings(ranging("poc"), ranging("centroid")), "evlcp-fast": Brings(ranging("poc"))}
+    install(monkeypatch, *((owner, owner, partial(both.get, owner)) for owner in both))
     registry = Registry.load()
     assert registry.find("ranging", "centroid").distribution == "evlcp-sdk"
     assert len(registry.installed("ranging")) == 3
-    with pytest.raises(PluginError) as caught:
+    with pytest.raises(PluginError, match=r"^two ranging algorithms named 'poc': one of ") as caught:
         registry.find("ranging", "poc")
-    assert str(caught.value).startswith("two ranging algorithms named 'poc': one of ")
-    assert "evlcp-sdk" in str(caught.value)
-    assert "evlcp-fast" in str(caught.value)
+    assert all(owner in str(caught.value) for owner in both)
     assert caught.value.exit_code == 2
 
 
@@ -149,16 +148,15 @@ def test_a_plugin_that_fails_when_asked_is_left_out_from_then_on() -> None:
     assert registry.ask("evlcp_open_events", url="cam:0") == answers
 
 
-class Commands:
+def adding(command: Callable[..., None], fails: bool = False) -> Callable[[], object]:
     """A plugin that adds a command, and may fail behind that."""
 
-    def __init__(self, command: Callable[..., None], fails: bool = False) -> None:
-        self.command, self.fails = command, fails
-
     @hookimpl
-    def evlcp_register_commands(self, app: Any) -> None:
-        app.command()(self.command)
-        assert not self.fails, "by design"
+    def add(app: Any) -> None:
+        app.command()(command)
+        assert not fails, "by design"
+
+    return lambda: SimpleNamespace(evlcp_register_commands=add)
 
 
 def mine() -> None:
@@ -175,9 +173,9 @@ def odd(x: "Nothing") -> None: ...  # type: ignore[name-defined]  # noqa: F821
     ("stranger", "reason"),
     [
         (missing, "cannot be imported: ModuleNotFoundError"),
-        (lambda: Commands(mine, fails=True), "evlcp_register_commands() fails: AssertionError: by design"),
-        (lambda: Commands(odd), "its commands cannot be built: NameError"),
-        (lambda: Commands(receive), "has the command 'receive', which is there already"),
+        (adding(mine, fails=True), "evlcp_register_commands() fails: AssertionError: by design"),
+        (adding(odd), "its commands cannot be built: NameError"),
+        (adding(receive), "has the command 'receive', which is there already"),
     ],
 )
 def test_the_command_line_goes_on_without_a_broken_plugin(stranger, reason, monkeypatch, evlcp) -> None:
@@ -198,7 +196,7 @@ def test_the_command_line_goes_on_without_a_broken_plugin(stranger, reason, monk
 
 
 def test_a_command_of_a_plugin_is_one_of_ours(monkeypatch: pytest.MonkeyPatch, evlcp: Any) -> None:
-    install(monkeypatch, ("stranger", "evlcp-stranger", lambda: Commands(mine)), beside=True)
+    install(monkeypatch, ("stranger", "evlcp-stranger", adding(mine)), beside=True)
     done = evlcp("--help")
     assert (done.code, done.err) == (0, "")
     assert "mine" in done.out
@@ -206,12 +204,9 @@ def test_a_command_of_a_plugin_is_one_of_ours(monkeypatch: pytest.MonkeyPatch, e
 
 
 def test_broken_and_conflicting_plugins_are_listed(monkeypatch: pytest.MonkeyPatch, evlcp: Any) -> None:
-    install(
-        monkeypatch,
-        ("a", "evlcp-sdk", lambda: Brings(ranging("poc"))),
-        ("b", "evlcp-fast", lambda: Brings(ranging("poc"))),
-        ("cam", "evlcp-cam", missing),
-    )
+    owners = ("evlcp-sdk", "evlcp-fast")
+    both = [(owner, owner, lambda: Brings(ranging("poc"))) for owner in owners]
+    install(monkeypatch, *both, ("cam", "evlcp-cam", missing))
     done = evlcp("plugins")
     assert done.code == 0
     assert [line[:6] for line in done.out.splitlines() if "poc" in line] == ["! poc "] * 2
