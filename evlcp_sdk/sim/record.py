@@ -56,23 +56,14 @@ def truth_of(
         "scene": _scene_of(simulation),
         "bars": [_bar_of(light, scene.duration_s) for light in simulation.bars],
         "others": _others(simulation, position, attitude),
-        "camera": {
-            "focal_mm": camera.focal_mm,
-            "pitch_um": camera.pitch_um,
-            "width": camera.width,
-            "height": camera.height,
-            "cx": camera.centre_px[0],
-            "cy": camera.centre_px[1],
-        },
-        "t_s": [round(float(t), 3) for t in t_s],
-        "distance_m": [[round(float(v), 5) for v in column] for column in depth.T],
-        "bar_centre_px": [
-            [[round(float(v), 3) for v in place[:, i, axis]] for axis in (0, 1)]
-            for i in range(len(simulation.bars))
-        ],
+        "camera": _named(camera, "focal_mm", "pitch_um", "width", "height")
+        | dict(zip(("cx", "cy"), camera.centre_px, strict=True)),
+        "t_s": t_s.tolist(),
+        "distance_m": _rounded(depth.T, 5),
+        "bar_centre_px": [_rounded(bar, 3) for bar in place.transpose(1, 2, 0)],
         "camera_path": {
-            "position_m": [[round(float(v), 5) for v in axis] for axis in position.T],
-            "attitude_deg": [[round(float(v), 5) for v in axis] for axis in np.degrees(attitude).T],
+            "position_m": _rounded(position.T, 5),
+            "attitude_deg": _rounded(np.degrees(attitude).T, 5),
         },
         "psf_sigma_px": [blur_sigma_px(float(d), scene.lens, camera) for d in depth[0]],
         "e_led": [light.light_w_m2 for light in simulation.bars],
@@ -86,22 +77,24 @@ def truth_of(
     return truth_from_table(found, links={light.link.digest: light.link for light in simulation.bars})
 
 
+def _rounded(rows: Floats, digits: int) -> list[list[float]]:
+    return [[round(value, digits) for value in row] for row in rows.tolist()]
+
+
+def _named(given: object, *names: str) -> dict[str, Any]:
+    """Some of a description's values, by name."""
+    return {name: getattr(given, name) for name in names}
+
+
 def _bar_of(light: BarLight, duration_s: float) -> dict[str, Any]:
     """What the truth says of a bar and of what it sends."""
     bar = light.bar
     found = {
-        "x_m": bar.x_m,
-        "y_m": bar.y_m,
-        "z_m": bar.z_m,
+        **_named(bar, "x_m", "y_m", "z_m", "width_m", "ppm", "led_w_m2", "chips_file", "payload"),
         "length_m": light.link.bar.length_m,
-        "width_m": bar.width_m,
         "link": light.link.digest,
         "seed": light.payload_seed,
-        "ppm": bar.ppm,
         "start_chip": light.start_chip,
-        "led_w_m2": bar.led_w_m2,
-        "chips_file": bar.chips_file,
-        "payload": bar.payload,
         "symbols": light.sent_symbols(duration_s),
         "covered": sorted({*bar.covered, *light.dark}),
         "cover_s": [list(span) for span in bar.cover_s],
@@ -113,24 +106,15 @@ def _bar_of(light: BarLight, duration_s: float) -> dict[str, Any]:
 def _scene_of(simulation: Simulation) -> dict[str, Any]:
     """The parameters of a scene."""
     scene = simulation.scene
-    sensor, motion = scene.sensor, scene.motion
     return {
-        "name": scene.name,
-        "duration_s": scene.duration_s,
-        "distance_m": motion.distance_m,
-        "speed_mps": motion.speed_mps,
-        "vib_rate_rad_s": motion.vib_rate_rad_s,
+        **_named(scene, "name", "duration_s", "seed", "flicker_lamps", "t0_us"),
+        **_named(scene.motion, "distance_m", "speed_mps", "vib_rate_rad_s"),
+        **_named(scene.lens, "focus_m", "f_number", "halo"),
+        **_named(scene.sensor, *OF_SENSOR),
         "background_w_m2": scene.background.light_w_m2,
         "background_texture": scene.background.texture,
         "hot_pixels": simulation.hot_pixels,
-        "focus_m": scene.lens.focus_m,
-        "f_number": scene.lens.f_number,
-        **{name: getattr(sensor, name) for name in OF_SENSOR},
         "hpf_us": 0.0,
-        "halo": scene.lens.halo,
-        "seed": scene.seed,
-        "flicker_lamps": scene.flicker_lamps,
-        "t0_us": scene.t0_us,
         **_of_a_road(scene),
     }
 
@@ -158,14 +142,9 @@ def _others(simulation: Simulation, position: Floats, attitude: Floats) -> list[
         for j, reflection in enumerate(reflections_of(simulation.scene, i)):
             images = light.images[j * columns : (j + 1) * columns]
             # The middle of the columns' middles is the bar's.
-            strips = [replace(one, strip=replace(one.strip, cuts=(-0.5, 0.0, 0.5))) for one in images]
-            place = np.mean([simulation.seen(one, position, attitude)[0][:, 1] for one in strips], 0)
-            found.append(
-                {
-                    "kind": "mirror" if reflection.kind == "road" else "ghost",
-                    "src": i,
-                    "gain": reflection.share,
-                    "centre_px": [[round(float(v), 3) for v in axis] for axis in place.T],
-                }
-            )
+            strips = [replace(image, strip=replace(image.strip, cuts=(-0.5, 0.0, 0.5))) for image in images]
+            place = np.mean([simulation.seen(strip, position, attitude)[0][:, 1] for strip in strips], 0)
+            kind = "mirror" if reflection.kind == "road" else "ghost"
+            one = {"kind": kind, "src": i, "gain": reflection.share, "centre_px": _rounded(place.T, 3)}
+            found.append(one)
     return found
