@@ -1,13 +1,17 @@
-"""NMEA sentences, read back by an independent parser."""
+"""NMEA sentences, read back by an independent parser; reports and answers as those of gpsd."""
 
 from datetime import UTC, datetime, timedelta
 
+import numpy as np
 import pynmea2
 import pytest
 from hypothesis import given, strategies as st
 
 from evlcp_sdk.place.gnss import checksum
+from evlcp_sdk.place.navigator import Place
+from evlcp_sdk.results.gpsd import answer, sky, tpv
 from evlcp_sdk.results.nmea import clock_of, gga, rmc
+from evlcp_sdk.values import Fix
 
 ZERO = datetime(2026, 3, 1, 23, 59, 58, tzinfo=UTC)
 
@@ -60,3 +64,32 @@ def test_the_standards_own_sum() -> None:
 def test_sixty_minutes_carry() -> None:
     assert ",0.00,010326," in rmc(clock_of(0, ZERO), (0.0, 0.0, 0.0), (0.0, 359.999))
     assert ",3600.0000000,N," in gga(clock_of(0, None), (35.9999999999, 0.0, 0.0), 1)
+
+
+def test_reports_say_what_the_fix_says() -> None:
+    spread = np.diag([0.09, 0.16, 0.25])
+    here = 600e3, 35.68, 139.77, 60.0, np.zeros(3), spread
+    place = Place(*here, 10.0, 0.0, left_out=False, starts=False)
+    fix = Fix(*here, spread, 0.0, 0.0, 0.0, 0.1, (0, 3), verified=True)
+    report = tpv(fix, place, ZERO)
+    assert report["time"] == "2026-03-01T23:59:58.600Z"
+    assert report["altMSL"] + report["geoidSep"] == pytest.approx(report["altHAE"]) == 60.0
+    assert (report["epx"], report["epy"], report["epv"], report["eph"]) == (0.3, 0.4, 0.5, 0.5)
+    assert (report["mode"], report["speed"], report["track"]) == (3, 10.0, 0.0)
+    assert sky(fix, ZERO)["satellites"] == [{"PRN": 0, "used": True}, {"PRN": 3, "used": True}]
+    refused = Fix.refused(1e6, (2,), "misfit", "")
+    assert tpv(refused, None, None) == {"class": "TPV", "device": "evlcp", "mode": 1}
+    assert sky(refused, None)["uSat"] == 0
+
+
+def test_clients_are_answered() -> None:
+    watch = {"enable": False, "json": False, "nmea": False}
+    said = answer('?WATCH={"enable":true,"json":true};', watch, {})
+    assert [one["class"] for one in said] == ["DEVICES", "WATCH"]
+    assert watch == {"enable": True, "json": True, "nmea": False}
+    answer('?WATCH={"enable":true,"nmea":true}', watch, {})
+    assert watch["nmea"]
+    assert answer("?VERSION;", watch, {})[0]["proto_major"] == 3
+    assert answer("?POLL;", watch, {"TPV": {"mode": 3}})[0]["tpv"] == [{"mode": 3}]
+    for fault in ("?WATCH={", "?WATCH=[1]", "hello", "?\x00"):
+        assert answer(fault, watch, {})[0]["class"] == "ERROR"
