@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ import typer
 
 from evlcp_sdk.cli._app import add_plugin_commands, make_app
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, write_events
-from evlcp_sdk.place.gnss import checksum
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results import nmea
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, load_sites, to_toml
 from evlcp_sdk.values import Events, Triggers
 from tests.conftest import rows_of
@@ -468,22 +469,12 @@ def test_a_car_surveys_a_new_bar_on_its_way(evlcp: Evlcp, street: Path, tmp_path
 
 def nmea_of(path: dict[str, list[float]], at_ms: Sequence[int], file: Path) -> Path:
     """GGA and GST of a camera's path from noon on, 0.1 m precise."""
-
-    def angle(degrees: float, digits: int) -> str:
-        whole = int(degrees)
-        return f"{whole:0{digits}d}{(degrees - whole) * 60:010.7f}"
-
     lines = []
     for ms in at_ms:
-        latitude, longitude, height = (
-            path[f"{key}"][ms] for key in ("latitude_deg", "longitude_deg", "height_m")
-        )
-        clock = f"120000.{ms // 10:02d}"
-        lines.append(
-            f"GPGGA,{clock},{angle(latitude, 2)},N,{angle(longitude, 3)},E,1,9,1,{height - 30},M,30,M,,"
-        )
-        lines.append(f"GPGST,{clock},,,,,0.1,0.1,0.1")
-    file.write_text("".join(f"${line}*{checksum(line)}\r\n" for line in lines))
+        clock = nmea.clock_of(ms * 1e3, datetime(2026, 3, 1, 12, tzinfo=UTC))
+        place = path["latitude_deg"][ms], path["longitude_deg"][ms], path["height_m"][ms]
+        lines += [nmea.gga(clock, place, 9), nmea.gst(clock, 0.0, 0.01 * np.eye(3))]
+    file.write_text("".join(lines))
     return file
 
 
