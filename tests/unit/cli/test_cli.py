@@ -20,6 +20,7 @@ from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, write_events
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results import nmea
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, load_sites, to_toml
+from evlcp_sdk.simulated import simulate
 from evlcp_sdk.values import Events, Triggers
 from tests.conftest import rows_of
 
@@ -332,15 +333,9 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "[motion]\npitch_deg = 4.0\nvib_rate_rad_s = 0.0\n"
         f"[[bars]]\nx_m = -3.0\n{bar}[[bars]]\nx_m = 3.0\nz_m = -5.0\n{bar}"
     )
-    code = (
-        "from pathlib import Path; import json, sys\n"
-        "from evlcp_sdk.cli.main import main\n"
-        "sys.argv = ['evlcp', 'simulate', 'scene.toml', '-o', 'rec.raw']\nmain()\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=folder, stdout=subprocess.DEVNULL)
-    sites = json.loads((folder / "rec.truth.json").read_text())["sites"]
-    lines = ["[[bar]]\n" + "".join(f"{k} = {v}\n" for k, v in s.items() if v is not None) for s in sites]
-    (folder / "site.toml").write_text("\n".join(lines))
+    written = simulate(folder / "scene.toml").save(folder / "rec.raw")
+    (site,) = (path for path in written if path.name == "rec.site.toml")
+    site.rename(folder / "site.toml")
     return folder
 
 
