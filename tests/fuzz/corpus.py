@@ -37,14 +37,7 @@ WIDTH, HEIGHT = 64, 48
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file.
-
-    Attributes:
-        name: What it is called in the tests.
-        file: Name that it is read under.
-        data: A good one.
-        read: Reads it from a path; raises for what is wrong.
-    """
+    """A kind of file: the name that it is read under, a good one, and what raises for what is wrong in it."""
 
     name: str
     file: str
@@ -54,12 +47,8 @@ class Kind:
 
 def some_events(n=1500):
     rng = np.random.default_rng(1)
-    return Events.of(
-        100 + rng.integers(0, 40, n).cumsum(),
-        rng.integers(0, WIDTH, n),
-        rng.integers(0, HEIGHT, n),
-        rng.integers(0, 2, n),
-    )
+    times = 100 + rng.integers(0, 40, n).cumsum()
+    return Events.of(times, *(rng.integers(0, most, n) for most in (WIDTH, HEIGHT, 2)))
 
 
 def read_recording(path):
@@ -105,24 +94,12 @@ def _db3(folder):
     return _written(folder / "a.db3", write_sqlite, messages, range(len(messages)))
 
 
-def _update(folder):
-    package = Package("stm32f405-8mhz", {1: bytes(range(200)), 2: bytes(range(100, 250))})
-    return package.to_json().encode()
-
-
-def _store(path):
+def _summarized(path):
     with Store(path) as store:
         summarize(store)
 
 
-def _frames(path):
-    read_frames(path.parent)
-
-
-def _summary(path):
-    read_summary(path.parent)
-
-
+UPDATE = Package("stm32f405-8mhz", {1: bytes(range(200)), 2: bytes(range(100, 250))})
 NMEA = b"".join(
     f"${line}*{checksum(line)}\r\n".encode()
     for line in (
@@ -190,17 +167,17 @@ def kinds(folder, store):
         Kind("MCAP", "a.mcap", _recording(folder, "a.mcap"), read_recording),
         Kind("db3", "a.db3", _db3(folder), read_recording),
         Kind("NMEA", "a.nmea", NMEA, lambda path: read_nmea(path, datetime(2026, 11, 1, tzinfo=UTC), 3.0)),
-        Kind("update", "a.json", _update(folder), Package.read),
+        Kind("update", "a.json", UPDATE.to_json().encode(), Package.read),
         Kind("truth", "a.truth.json", json.dumps(truth).encode(), read_truth),
-        Kind("frames.csv", "frames.csv", FRAMES, _frames),
-        Kind("summary.json", "summary.json", SUMMARY, _summary),
+        Kind("frames.csv", "frames.csv", FRAMES, lambda path: read_frames(path.parent)),
+        Kind("summary.json", "summary.json", SUMMARY, lambda path: read_summary(path.parent)),
         Kind("poses", "a.csv", POSES, read_poses),
         Kind("attitude", "a.csv", ATTITUDE, AttitudeLog.read),
         Kind("sites", "a.toml", SITES, load_sites),
         Kind("link", "a.toml", (EXAMPLES / "link.toml").read_bytes(), load_link),
         Kind("scene", "a.toml", (EXAMPLES / "scenes" / "street.toml").read_bytes(), load_scene),
         Kind("campaign", "a.toml", (EXAMPLES / "campaigns" / "rates.toml").read_bytes(), plan_of),
-        Kind("results", "a.sqlite", store, _store),
+        Kind("results", "a.sqlite", store, _summarized),
         Kind("symbols", "a.json", json.dumps({"symbols": symbols}).encode(), lambda p: read_symbols(p, None)),
         Kind("masks", "a.npy", masks.read_bytes(), lambda p: read_masks(p, link)),
         Kind("inventory", "a.toml", INVENTORY, read_inventory),

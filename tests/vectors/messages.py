@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from itertools import product
 
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Kind, Message, split
@@ -24,32 +25,29 @@ def messages():
 
 def vectors():
     packets = []
-    for profile in PROFILES:
-        for code in ("polar", "none"):
-            coder = load_link(
-                overrides=[f"modulation.id={profile}", f"error-correction.id={code}"]
-            ).block_coder()
-            for message in messages():
-                for block in split(message, coder.digest, coder.block_bytes):
-                    packed = block.pack(coder.block_bytes)
-                    symbols = coder.symbols(packed).astype("uint8").tobytes()
-                    packets.append(
-                        {
-                            "profile": profile,
-                            "error_correction": code,
-                            "codebook": coder.digest.hex(),
-                            "kind": block.kind.name.lower(),
-                            "transmitter_id": block.transmitter_id,
-                            "sequence": block.sequence,
-                            "index": block.index,
-                            "length": block.length,
-                            "part": block.part.hex(),
-                            "block": packed.hex(),
-                            "symbols": symbols.hex()
-                            if code == "none"
-                            else "sha256:" + hashlib.sha256(symbols).hexdigest(),
-                        }
-                    )
+    for profile, code in product(PROFILES, ("polar", "none")):
+        overrides = [f"modulation.id={profile}", f"error-correction.id={code}"]
+        coder = load_link(overrides=overrides).block_coder()
+        for message in messages():
+            for block in split(message, coder.digest, coder.block_bytes):
+                packed = block.pack(coder.block_bytes)
+                symbols = coder.symbols(packed).astype("uint8").tobytes()
+                packet = {
+                    "profile": profile,
+                    "error_correction": code,
+                    "codebook": coder.digest.hex(),
+                    "kind": block.kind.name.lower(),
+                    "transmitter_id": block.transmitter_id,
+                    "sequence": block.sequence,
+                    "index": block.index,
+                    "length": block.length,
+                    "part": block.part.hex(),
+                    "block": packed.hex(),
+                    "symbols": symbols.hex(),
+                }
+                if code != "none":
+                    packet["symbols"] = "sha256:" + hashlib.sha256(symbols).hexdigest()
+                packets.append(packet)
     digest = load_link().block_coder().digest
     return {
         "interleaver_960": interleaver(960).tolist(),

@@ -6,7 +6,7 @@ from evlcp_barker import _kernels
 from evlcp_barker.bound import due_chips, guard_chips, least_correlation, preamble_share
 from evlcp_barker.pilots import Barker13Pilots
 from evlcp_barker.synchronization import BarkerSync
-from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
+from evlcp_wh.modulation import Wh4x2
 from evlcp_wh.pilots import WhPilots
 from numpy.testing import assert_allclose
 
@@ -59,32 +59,29 @@ def answers_of(chips, slow):
     return counts
 
 
-PROFILES = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
 CLUSTERS, FRAMES, START_US = 16, 10, 5000.0
-BOOKS = {
-    name: Codebook(name, WhPilots().preamble(), WhPilots().codes(CLUSTERS), modulation.codewords())
-    for name, modulation in PROFILES.items()
-}
-FORMAT = PacketFormat.of(BOOKS["wh4x2"], FRAMES)
+
+
+def book_of(preamble, clusters=CLUSTERS):
+    return Codebook("own", preamble, WhPilots().codes(clusters), Wh4x2().codewords())
+
+
+BOOK = book_of(WhPilots().preamble())
+FORMAT = PacketFormat.of(BOOK, FRAMES)
 PERIOD_US = FORMAT.packet_chips * CHIP_US
 
 
-def packets_of(rng, n, profile="wh4x2"):
+def packets_of(rng, n, book=BOOK, frames=FRAMES):
     """Chips of packets with random symbols, (chips, K)."""
-    book = BOOKS[profile]
-    symbols = rng.integers(0, len(book.codewords), (n, FRAMES, CLUSTERS))
+    symbols = rng.integers(0, book.carrying, (n, frames, book.clusters))
     return np.concatenate([packet_chips(s, book) for s in symbols])
 
 
-def synchronizer():
-    return BarkerSync().compile(BOOKS["wh4x2"], FORMAT)
-
-
-def locks_of(t_us, p):
-    """Locks, and the state at the end, by steps of 1 ms."""
-    sync, locks, begin = synchronizer(), [], 0
+def locks_of(t_us, p, sync=None, step_us=1000):
+    """Locks, and the state at the end, by steps."""
+    sync, locks, begin = sync or BarkerSync().compile(BOOK, FORMAT), [], 0
     state = sync.init()
-    for until in range(0, int(t_us[-1]) + 5000, 1000):
+    for until in range(0, int(t_us[-1]) + 9000, step_us):
         end = int(np.searchsorted(t_us, until))
         state, found = sync.step(state, t_us[begin:end], p[begin:end], until)
         locks += found
@@ -156,21 +153,12 @@ def test_noise_that_ends_at_once_is_no_preamble(rate_hz):
     book = Codebook("lit first", preamble, pilots, np.array([[1, 0, 1, 1, 0], [0, 1, 0, 0, 1]]))
     listener = BarkerSync().compile(book, PacketFormat.of(book, 10))
     for seed in range(12):
-        rng = np.random.default_rng(seed)
-        many = int(rate_hz * 0.06)
+        rng, many = np.random.default_rng(seed), int(rate_hz * 0.06)
         t_us, p = np.sort(rng.integers(0, 60_000, many)), rng.integers(0, 2, many).astype(np.uint8)
-        state = listener.init()
-        for until_us in range(1500, 70_000, 1500):
-            one = slice(*np.searchsorted(t_us, [until_us - 1500, until_us]))
-            state, locks = listener.step(state, t_us[one], p[one], until_us)
-            assert not locks
+        assert locks_of(t_us, p, listener, 1500)[0] == []
 
 
 # From which correlation on it is a preamble
-
-
-def book_of(preamble, clusters=CLUSTERS, modulation="wh4x2"):
-    return Codebook("own", preamble, WhPilots().codes(clusters), PROFILES[modulation].codewords())
 
 
 SLOW = {f"chips of {n}": np.repeat(chips_of_values(BARKER13), n) for n in (2, 3, 4)}
@@ -187,12 +175,7 @@ def test_a_preamble_passes_and_other_codes_do_not(name, clusters):
     """Both as bad as can be: the preamble on slow pixels, the others on pixels that answer at once."""
     book = book_of(OWN[name], clusters)
     rng = np.random.default_rng(7)
-    chips = np.concatenate(
-        [
-            packet_chips(rng.integers(0, 64, (FRAMES, clusters)), book)
-            for _ in range(8 if clusters > 1 else 40)
-        ]
-    )
+    chips = packets_of(rng, 8 if clusters > 1 else 40, book)
     packet = PacketFormat.of(book, FRAMES).packet_chips
     signs, due = 2.0 * book.preamble - 1, due_chips(book.preamble)
     least = least_correlation(book, FRAMES, 1)
@@ -235,14 +218,8 @@ def test_a_preamble_of_sparse_pulses_is_one_lock_a_packet():
     book = Codebook("sparse", code, slots[places].reshape(12, -1), words.reshape(25, -1))
     packet = PacketFormat.of(book, 7)
     rng = np.random.default_rng(0)
-    symbols = rng.integers(0, 16, (4, 7, 12))
-    t, p = events_of(np.concatenate([packet_chips(one, book) for one in symbols]), rng, START_US)
-    sync = BarkerSync().compile(book, packet)
-    state, locks = sync.init(), []
-    for until in range(0, int(t[-1]) + 9000, 1000):
-        inside = (t >= until - 1000) & (t < until)
-        state, found = sync.step(state, t[inside], p[inside], until)
-        locks += found
+    events = events_of(packets_of(rng, 4, book, 7), rng, START_US)
+    locks, _ = locks_of(*events, BarkerSync().compile(book, packet))
     apart = packet.packet_chips * CHIP_US
     assert_allclose([lock.packet_t_us for lock in locks], START_US + apart * np.arange(4), atol=50)
 
@@ -275,7 +252,7 @@ def test_packet_start_clock_and_delays(ppm, delay_us):
 
 
 def test_a_lock_does_not_wait_for_the_next_packet():
-    rng, sync = np.random.default_rng(3), synchronizer()
+    rng, sync = np.random.default_rng(3), BarkerSync().compile(BOOK, FORMAT)
     t, p = events_of(packets_of(rng, 4), rng, START_US, ppm=30, missing_off=0.2)
     # The preamble, the guard of the peak behind it, and one step.
     until_us = int(START_US + (26 + 3 + 2) * CHIP_US)
@@ -326,25 +303,19 @@ def test_the_second_preamble_after_a_jump_is_believed(jump_us):
 # Latency that changes, preambles that are half seen
 
 
-def late(events, from_packet, to_packet, by_us):
-    """The events of some packets, later by as much; in order."""
-    t, p = events
-    number = (t - START_US) / PERIOD_US
-    t = t + np.where((number > from_packet) & (number < to_packet), by_us, 0)
-    order = np.argsort(t, kind="stable")
-    return t[order], p[order]
-
-
 @pytest.mark.parametrize(("ppm", "by_us"), [(-60, 30), (0, 15), (60, 50)])
 @pytest.mark.parametrize("packets", [(1.9, 3.9), (3.9, 4.9), (4.9, 20)])
 def test_latency_is_no_clock(ppm, by_us, packets):
     rng = np.random.default_rng(9)
-    events = events_of(packets_of(rng, 12), rng, START_US, ppm=ppm, missing_off=0.2)
-    locks, state = locks_of(*late(events, *packets, by_us))
+    t, p = events_of(packets_of(rng, 12), rng, START_US, ppm=ppm, missing_off=0.2)
+    number = (t - START_US) / PERIOD_US
+    late = t + by_us * ((number > packets[0]) & (number < packets[1]))
+    order = np.argsort(late, kind="stable")
+    locks, state = locks_of(late[order], p[order])
     assert len(locks) == 12
     assert state.clock.packet == 11
     # What is heard late is read late: both polarities, at once.
-    steady, _ = locks_of(*events)
+    steady, _ = locks_of(t, p)
     for k, (lock, usual) in enumerate(zip(locks, steady, strict=True)):
         dark = packets[0] < k < packets[1]
         for which in ("delay_on_us", "delay_off_us"):
@@ -359,8 +330,7 @@ def test_latency_is_no_clock(ppm, by_us, packets):
 def test_the_clock_tolerance_is_a_bound(ppm, tolerance_ppm):
     rng = np.random.default_rng(11)
     t, p = events_of(packets_of(rng, 10), rng, START_US, ppm=ppm)
-    sync = BarkerSync(clock_tolerance_ppm=tolerance_ppm).compile(BOOKS["wh4x2"], FORMAT)
-    _, locks = sync.step(sync.init(), t, p, int(t[-1]) + 5000)
+    locks, _ = locks_of(t, p, BarkerSync(clock_tolerance_ppm=tolerance_ppm).compile(BOOK, FORMAT))
     rates = 1e6 * (np.array([lock.chip_us for lock in locks]) / CHIP_US - 1)
     assert np.abs(rates).max() <= tolerance_ppm + 1e-6
     # The packets are heard where they are all the same.

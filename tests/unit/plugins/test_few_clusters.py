@@ -33,6 +33,10 @@ def link_with(layout, *overrides):
     return load_link(overrides=[*LAYOUTS[layout], *overrides])
 
 
+def compiled(link):
+    return link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_link_that_names_no_ranging_measures_its_bar(layout):
     link = link_with(layout)
@@ -40,7 +44,7 @@ def test_a_link_that_names_no_ranging_measures_its_bar(layout):
     beside = {"1 clusters": "none", "2 clusters": "none", "one row of two": "none", "not alike": "centroid"}
     wanted = beside.get(layout, "poc" if layout in ("ring", "three LEDs", "two lamps") else "joint-scale")
     assert link.table["ranging"]["id"] == wanted
-    link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+    compiled(link)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -48,37 +52,30 @@ def test_a_link_that_names_no_ranging_measures_its_bar(layout):
 def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name, layout):
     link = link_with(layout, f"ranging.id={name}")
     try:
-        measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+        measure = compiled(link)
     except ConfigError as refused:
         said = str(refused)
         settings = [f"ranging.{key}={value}" for key, value in re.findall(r"ranging\.(\w+) = (\d+)$", said)]
         other = re.search(r"use '([\w-]+)' for this layout", said)
-        if other is not None:
-            settings.append(f"ranging.id={other[1]}")
-        elif settings:
-            settings.append(f"ranging.id={name}")
-        if settings:
-            better = link_with(layout, *settings)
-            better.algorithm("ranging").compile(better.camera, better.bar, better.codebook)
+        if settings or other:
+            compiled(link_with(layout, *settings, f"ranging.id={other[1] if other else name}"))
         else:
             assert "expected at least min_clusters" in said
         return
     if np.ptp(link.bar.cluster_centres_m()[:, 0]) > 0:
         return
     # What accepts a bar measures it: 8 px from cluster to cluster.
-    view = ideal_view(link.codebook, np.arange(link.bar.clusters) % len(link.codebook.codewords))
-    found = measure(view)
+    found = measure(ideal_view(link.codebook, np.arange(link.bar.clusters) % len(link.codebook.codewords)))
     if name == "none":
         assert np.isnan([found.distance_m, found.sigma_m]).all()
-        return
-    true_m = link.camera.distance_m(0.06, 8)
-    assert found.distance_m == pytest.approx(true_m, rel=1e-3)
+    else:
+        assert found.distance_m == pytest.approx(link.camera.distance_m(0.06, 8), rel=1e-3)
 
 
 @pytest.mark.parametrize("modulation", ["nrz", "ppm"])
 def test_joint_scale_reads_pilots_where_codewords_are_no_pair_codes(modulation):
     link = link_with("16 clusters", f"modulation.id={modulation}")
-    measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+    measure = compiled(link)
     view = ideal_view(link.codebook, np.arange(16))
     found, true_m = measure(view), link.camera.distance_m(0.06, 8)
     assert found.distance_m == pytest.approx(true_m, rel=1e-3)
@@ -94,4 +91,4 @@ def test_joint_scale_refuses_pilots_of_other_codes():
         "16 clusters", "modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed", "ranging.id=joint-scale"
     )
     with pytest.raises(ConfigError, match=r"the pilots are others; try ranging\.id = 'poc'"):
-        link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+        compiled(link)

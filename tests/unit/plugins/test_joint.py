@@ -68,11 +68,8 @@ def view_of(
         chips, selected, offset = chips.transpose(0, 2, 1), selected.transpose(0, 2, 1), offset[::-1]
     said = symbols.copy()
     said[list(wrong)] ^= 63
-    presence = PresenceMap(
-        selected.astype(np.float32), 2, selected, np.zeros((K, *chips.shape[1:]), np.float32)
-    )
     soft = SoftSymbols(said, np.zeros((K, 6), np.float32), 1.0)
-    return FrameView(chips.astype(np.int16), offset, presence, soft)
+    return FrameView(chips.astype(np.int16), offset, map_of(selected, chips), soft)
 
 
 def measured(view, **parameters):
@@ -102,16 +99,15 @@ def test_it_stands_tilt_motion_and_damage(how):
 def test_unknown_symbols_leave_the_pilot_of_their_clusters():
     sigma_m = []
     for seed in range(4, 12):
-        view = view_of(50.0, noise=0.5, seed=seed)
-        symbols = view.soft.symbols.copy()
-        symbols[[2, 3, 9]] = -1
-        soft = SoftSymbols(symbols, view.soft.llr, 1.0)
-        found = measured(FrameView(view.sums, view.offset_px, view.presence, soft))
+        view, some = view_of(50.0, noise=0.5, seed=seed), [2, 3, 9]
+        unknown, guess = view.soft.symbols.copy(), view.soft.symbols.copy()
+        # Guessed at, they would be left out or bend the fit.
+        unknown[some], guess[some] = -1, (guess[some] + 1) % 64
+        found, guessed = (
+            measured(replace(view, soft=replace(view.soft, symbols=symbols))) for symbols in (unknown, guess)
+        )
         assert found.distance_m == pytest.approx(50, rel=4e-3)
         assert found.pairs == 15
-        # Guessed at, they would be left out or bend the fit.
-        symbols[[2, 3, 9]] = (view.soft.symbols[[2, 3, 9]] + 1) % 64
-        guessed = measured(FrameView(view.sums, view.offset_px, view.presence, soft))
         sigma_m.append((found.sigma_m, guessed.sigma_m))
     assert np.mean(sigma_m, 0)[0] < np.mean(sigma_m, 0)[1], sigma_m
 
@@ -123,7 +119,7 @@ def test_values_that_the_fit_does_not_explain_give_no_distance(shift):
     sums = np.roll(view.sums, shift, 1)
     if not shift:
         sums = np.random.default_rng(3).integers(-3, 4, view.sums.shape).astype(np.int16)
-    found = measured(FrameView(sums, view.offset_px, view.presence, view.soft))
+    found = measured(replace(view, sums=sums))
     assert np.isnan(found.distance_m)
     assert found.pairs == 0
 
@@ -144,18 +140,17 @@ def side_by_side(view):
     _, height, _ = view.sums.shape
     # The row of the middle boundary, in whole cells: what is cut off belongs to no pair of neighbours.
     half = height // 4 * 2
+    sums = np.concatenate([view.sums[:, :half], view.sums[:, half : 2 * half]], axis=2)
+    whole = view.presence.selected
+    selected = np.zeros((K, half // 2, 2 * whole.shape[2]), np.bool_)
+    selected[: K // 2, :, : whole.shape[2]] = whole[: K // 2, : half // 2]
+    selected[K // 2 :, :, whole.shape[2] :] = whole[K // 2 :, half // 2 : half]
+    return replace(view, sums=sums, presence=map_of(selected, sums))
 
-    def moved(image, rows):
-        return np.concatenate([image[:, :rows], image[:, rows : 2 * rows]], axis=2)
 
-    seen, dark = view.presence, np.zeros((K // 2, half // 2, view.sums.shape[2] // 2), np.bool_)
-    upper = np.concatenate([seen.selected[: K // 2, : half // 2], dark], axis=2)
-    lower = np.concatenate([dark, seen.selected[K // 2 :, half // 2 : half]], axis=2)
-    selected = np.concatenate([upper, lower])
-    sums = moved(view.sums, half)
+def map_of(selected, sums):
     pixels = np.zeros((K, *sums.shape[1:]), np.float32)
-    presence = PresenceMap(selected.astype(np.float32), 2, selected, pixels)
-    return replace(view, sums=sums, presence=presence)
+    return PresenceMap(selected.astype(np.float32), 2, selected, pixels)
 
 
 def test_two_columns_give_the_distance_of_both_and_its_sigma():
@@ -175,11 +170,13 @@ def test_two_columns_give_the_distance_of_both_and_its_sigma():
     assert measure(side_by_side(view_of(50.0, dark=tuple(range(16))))).pairs == 0
 
 
-def random_codes(rng):
-    return np.concatenate([PILOTS, WORDS[rng.integers(0, 64, K)]], axis=1)
+def random_codes(seed):
+    symbols = np.random.default_rng(seed).integers(0, 64, K)
+    return np.concatenate([PILOTS, WORDS[symbols]], axis=1)
 
 
-STILL = np.zeros(32)
+STILL, SPACING = np.zeros(32), 8.6
+BOUNDARIES = 74.5 + SPACING * (np.arange(1, K) - K / 2)
 
 
 def fit_of(codes, dim, values, spacing, offset_px=STILL):
@@ -201,21 +198,21 @@ def values_of(codes, places, rows):
 @pytest.mark.parametrize("dim", [0.05, 0.5, 2.0])
 def test_boundaries_stay_where_one_sign_is_missed(dim):
     """Pilots, and symbols, say more steps of one sign at some boundaries."""
-    codes, spacing = random_codes(np.random.default_rng(3)), 8.6
-    values = 0.6 * values_of(codes, 74.5 + spacing * (np.arange(1, K) - K / 2), 150)
+    codes = random_codes(3)
+    values = 0.6 * values_of(codes, BOUNDARIES, 150)
     values *= np.where(values < 0, dim, 1)
-    fit, _ = fit_of(codes, dim, values, spacing)
-    assert fit[0] == pytest.approx(spacing, rel=2e-5)
+    fit, _ = fit_of(codes, dim, values, SPACING)
+    assert fit[0] == pytest.approx(SPACING, rel=2e-5)
 
 
 def test_boundaries_out_of_line_are_left_out_and_shown():
     """By up to half a pixel: of those farther off, a row's values say no more."""
-    codes, spacing = random_codes(np.random.default_rng(5)), 8.6
+    codes = random_codes(5)
     shift = np.zeros(K - 1)
     shift[[3, 12]] = 0.5, -0.4
-    values = 0.6 * values_of(codes, 74.5 + spacing * (np.arange(1, K) - K / 2) + shift, 150)
-    fit, (off, weight, _) = fit_of(codes, 1.0, values, spacing)
-    assert fit[0] == pytest.approx(spacing, rel=1e-4)
+    values = 0.6 * values_of(codes, BOUNDARIES + shift, 150)
+    fit, (off, weight, _) = fit_of(codes, 1.0, values, SPACING)
+    assert fit[0] == pytest.approx(SPACING, rel=1e-4)
     assert np.flatnonzero(weight == 0).tolist() == [3, 12]
     # As seen against a fit that they bent.
     assert_allclose(off, shift, atol=0.16)
@@ -223,14 +220,14 @@ def test_boundaries_out_of_line_are_left_out_and_shown():
 
 def test_shifts_by_sign_and_by_repeated_values_are_found():
     """Steps up lie 0.08 px lower than steps down, and what repeats a value looks smaller by 0.05 px."""
-    codes, spacing = random_codes(np.random.default_rng(7)), 8.6
-    boundaries, values = 74.5 + spacing * (np.arange(1, K) - K / 2), np.empty((16, 150))
+    codes = random_codes(7)
+    values = np.empty((16, 150))
     for i in range(16):
         again = codes[:, i] == codes[:, i - 1] if i else np.zeros(K)
         shift = 0.04 * np.sign(np.diff(codes[:, i])) + 0.05 * np.diff(again.astype(float))
-        values[i] = 0.6 * values_of(codes[:, i : i + 1], boundaries + shift, 150)[0]
-    fit, (off, weight, _) = fit_of(codes, 1.0, values, spacing)
-    assert fit[0] == pytest.approx(spacing, rel=2e-5)
+        values[i] = 0.6 * values_of(codes[:, i : i + 1], BOUNDARIES + shift, 150)[0]
+    fit, (off, weight, _) = fit_of(codes, 1.0, values, SPACING)
+    assert fit[0] == pytest.approx(SPACING, rel=2e-5)
     # The prior takes up to a tenth of them.
     assert_allclose(fit[5:], [0.04, 0.05], rtol=0.12)
     assert (weight > 0).all()
@@ -239,20 +236,19 @@ def test_shifts_by_sign_and_by_repeated_values_are_found():
 
 def test_a_value_is_read_half_a_chip_before_its_second_chips_middle():
     """Also where the image, held still by whole pixels, jumps between its chips."""
-    codes, spacing = random_codes(np.random.default_rng(7)), 8.6
+    codes = random_codes(7)
     place, values = 0.34 * (np.arange(32) + 0.5), np.empty((16, 150))
     for i in range(16):
         seen = 0.34 * (2 * i + 1) - np.rint(place[2 * i + 1])
-        boundaries = 74.5 + seen + spacing * (np.arange(1, K) - K / 2)
-        values[i] = 0.6 * values_of(codes[:, i : i + 1], boundaries, 150)[0]
-    fit, _ = fit_of(codes, 1.0, values, spacing, place - np.rint(place))
+        values[i] = 0.6 * values_of(codes[:, i : i + 1], BOUNDARIES + seen, 150)[0]
+    fit, _ = fit_of(codes, 1.0, values, SPACING, place - np.rint(place))
     # Spacing, place and drift.
-    assert_allclose(fit[:3], [spacing, 0, 0], atol=1e-5)
+    assert_allclose(fit[:3], [SPACING, 0, 0], atol=1e-5)
 
 
 def test_a_wave_of_the_pixels_shows_in_the_boundaries():
     """Boundaries seem off by 0.02 px times the sine of their place on the pixels."""
-    codes, spacing, b = random_codes(np.random.default_rng(8)), 8 + 1 / 15, np.arange(1, K) - K / 2
+    codes, spacing, b = random_codes(8), 8 + 1 / 15, np.arange(1, K) - K / 2
     places = 74.7 + spacing * b
     seem = places + 0.02 * np.sin(2 * np.pi * places)
     fit, (off, weight, wave) = fit_of(codes, 1.0, 0.6 * values_of(codes, seem, 150), spacing)

@@ -6,27 +6,17 @@ from evlcp_kalman.tracking import KalmanTracking
 from numpy.testing import assert_allclose
 
 
-def distance_filter(**parameters):
-    found = KalmanTracking(**parameters).compile().distance
-    assert found is not None
-    return found
-
-
-def run(filter_, t_us, values, sigma):
-    state, out = filter_.init(), []
-    for t, v in zip(t_us, values, strict=True):
-        state, value, s = filter_.step(state, t, np.array([v]), sigma)
-        out.append((value[0], s))
-    return np.array(out)
-
-
 def test_it_is_the_textbook_filter():
     """Step by step with full matrices, covariance in Joseph's form."""
     q, speed, sigma = 2.0, 15.0, 0.1
     rng = np.random.default_rng(0)
     t_us = np.cumsum(rng.uniform(2000, 8000, 40))
     z = 50 - 8 * t_us * 1e-6 + rng.normal(0, sigma, 40)
-    got = run(distance_filter(acceleration_m2_s3=q, speed_m_s=speed), t_us, z, sigma)
+    distance = KalmanTracking(acceleration_m2_s3=q, speed_m_s=speed).compile().distance
+    state, got = distance.init(), []
+    for t, value in zip(t_us, z, strict=True):
+        state, (value,), found_sigma = distance.step(state, t, np.array([value]), sigma)
+        got.append((value, found_sigma))
     x, P, H = np.array([z[0], 0.0]), np.diag([sigma**2, speed**2]), np.array([[1.0, 0.0]])
     want = [(x[0], np.sqrt(P[0, 0]))]
     for dt, value in zip(np.diff(t_us) * 1e-6, z[1:], strict=True):

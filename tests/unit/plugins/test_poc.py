@@ -7,7 +7,7 @@ from evlcp_poc import _kernels
 from evlcp_poc.correlation import blob_band, full_band, pair_shifts, phase_only_correlation
 from evlcp_poc.ranging import PocRanging
 from numpy.testing import assert_allclose
-from scipy.special import erf
+from scipy.stats import norm
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
@@ -71,27 +71,19 @@ def jackknife(values, weights, first, second, kept):
 
 def gaussian(centre, sigma, size):
     """A Gaussian's integral over each pixel of a line; pixel n reaches from n - 1/2 to n + 1/2."""
-    return np.diff(erf((np.arange(size + 1) - 0.5 - centre) / (np.sqrt(2) * sigma))) / 2
+    return np.diff(norm.cdf(np.arange(size + 1) - 0.5, centre, sigma))
 
 
 def box(centre, width, size):
     """The part of each pixel of a line that a box covers."""
-    edges = np.clip(np.arange(size + 1) - 0.5, centre - width / 2, centre + width / 2)
-    return np.diff(edges)
+    return np.diff(np.clip(np.arange(size + 1) - 0.5, centre - width / 2, centre + width / 2))
 
 
 def soft_box(centre, width, blur, size):
     """A box blurred by a Gaussian, the mean over each pixel of a line by 16 samples; and its slope."""
     x = (np.arange(16 * size) + 0.5) / 16 - 0.5 - centre
-
-    def edge(at):
-        return erf((x - at) / (np.sqrt(2) * blur)) / 2
-
-    def bell(at):
-        return np.exp(-((x - at) ** 2) / (2 * blur**2)) / (np.sqrt(2 * np.pi) * blur)
-
-    value = edge(-width / 2) - edge(width / 2)
-    slope = bell(width / 2) - bell(-width / 2)
+    left, right = norm(-width / 2, blur), norm(width / 2, blur)
+    value, slope = left.cdf(x) - right.cdf(x), right.pdf(x) - left.pdf(x)
     return value.reshape(size, 16).mean(1), slope.reshape(size, 16).mean(1)
 
 
@@ -188,11 +180,9 @@ def test_a_shift_in_noise_and_its_bound(spacing_px, noise):
 
 def view_of(maps):
     """A frame of which only the pixel maps are told."""
-    clusters = len(maps)
-    presence = PresenceMap(
-        np.zeros((clusters, 1, 1), np.float32), 2, np.zeros((clusters, 1, 1), bool), maps.astype(np.float32)
-    )
-    soft = SoftSymbols(np.zeros(clusters, np.int64), np.zeros((clusters, 6), np.float32), 1.0)
+    none = np.zeros((len(maps), 1, 1), np.float32)
+    presence = PresenceMap(none, 2, none > 0, maps.astype(np.float32))
+    soft = SoftSymbols(np.zeros(len(maps), np.int64), np.zeros((len(maps), 6), np.float32), 1.0)
     return FrameView(np.zeros((32, *maps.shape[1:]), np.int16), np.zeros((2, 32)), presence, soft)
 
 
@@ -208,13 +198,8 @@ def image_of(bar, distance_m, *, tilt_deg=0.0, blob="gaussian", offset=(0.2, -0.
     centres += [(columns - 1) / 2 + offset[0], (rows - 1) / 2 + offset[1]]
     for cluster, by in (moved or {}).items():
         centres[cluster] += by
-    if blob == "gaussian":
-        maps = [
-            np.outer(gaussian(y, 0.3 * pitch, rows), gaussian(x, 0.3 * pitch, columns)) for x, y in centres
-        ]
-    else:
-        maps = [np.outer(box(y, pitch, rows), box(x, 4.0, columns)) for x, y in centres]
-    maps = np.array(maps)
+    shape, sizes = (gaussian, (0.3 * pitch,) * 2) if blob == "gaussian" else (box, (pitch, 4.0))
+    maps = np.array([np.outer(shape(y, sizes[0], rows), shape(x, sizes[1], columns)) for x, y in centres])
     # A map is zero away from its cluster.
     return np.where(maps > 1e-4 * maps.max(), maps / maps.max(), 0)
 
@@ -269,15 +254,10 @@ def test_a_cluster_out_of_place_is_dropped(cluster, down):
 
 
 def test_sigma_is_the_error_that_noise_makes():
-    rng = np.random.default_rng(8)
-    maps = image_of(BAR, 70)
-    noisy = [
-        measured(np.where(maps > 0, np.clip(maps + rng.normal(0, 0.1, maps.shape), 0, 1), 0))
-        for _ in range(60)
-    ]
-    error = np.std([r.distance_m for r in noisy])
-    sigma = np.mean([r.sigma_m for r in noisy])
-    assert 0.5 < sigma / error < 2
+    rng, maps = np.random.default_rng(8), image_of(BAR, 70)
+    noisy = (np.clip(maps + rng.normal(0, 0.1, maps.shape), 0, 1) * (maps > 0) for _ in range(60))
+    distance_m, sigma_m = np.array([(r.distance_m, r.sigma_m) for r in map(measured, noisy)]).T
+    assert 0.5 < sigma_m.mean() / distance_m.std() < 2
 
 
 def test_centroid_leaves_out_the_rim_of_a_panel():
@@ -294,25 +274,24 @@ def test_centroid_leaves_out_the_rim_of_a_panel():
     assert every(view_of(moved)).distance_m < 0.97 * every(view_of(maps)).distance_m
 
 
-@pytest.mark.parametrize("clusters", [(3,), (3, 3), (2, 5, 2), (-1, 5), (2, 16)])
-def test_clusters_that_the_bar_has_not_are_refused(clusters):
-    with pytest.raises(ConfigError, match=r"ranging\.clusters = .*two or more different clusters of 0 to 15"):
-        PocRanging(clusters=clusters).compile(CAMERA, BAR, LINK.codebook)
+NOT_OF_THE_BAR = r"ranging\.clusters = .*two or more different clusters of 0 to 15"
+CROSS = LedTable(((1, 0, 0, 0), (-1, 0, 0, 0), (0, 1, 0, 1), (0, -1, 0, 1)))
 
 
 @pytest.mark.parametrize(
-    ("bar", "skip", "said"),
+    ("bar", "parameters", "said"),
     [
-        (BAR, 8, "skip_outer = 8: leaves 0 of 16"),
-        (BAR, 20, "set ranging.skip_outer = 7$"),
-        (BarLayout(LedGrid(rows=24)), 2, "set ranging.skip_outer = 1$"),
-        (BarLayout(LedTable(((1, 0, 0, 0), (-1, 0, 0, 0), (0, 1, 0, 1), (0, -1, 0, 1)))), 0, "apart"),
-        (BarLayout(LedGrid(rows=6)), 0, "needs two clusters"),
+        *((BAR, {"clusters": some}, NOT_OF_THE_BAR) for some in ((3,), (3, 3), (2, 5, 2), (-1, 5), (2, 16))),
+        (BAR, {"skip_outer": 8}, "skip_outer = 8: leaves 0 of 16"),
+        (BAR, {"skip_outer": 20}, "set ranging.skip_outer = 7$"),
+        (BarLayout(LedGrid(rows=24)), {"skip_outer": 2}, "set ranging.skip_outer = 1$"),
+        (BarLayout(CROSS), {}, "apart"),
+        (BarLayout(LedGrid(rows=6)), {}, "needs two clusters"),
     ],
 )
-def test_too_few_clusters_are_refused(bar, skip, said):
+def test_other_clusters_and_too_few_are_refused(bar, parameters, said):
     with pytest.raises(ConfigError, match=said):
-        PocRanging(skip_outer=skip).compile(CAMERA, bar, LINK.codebook)
+        PocRanging(**{"skip_outer": 0, **parameters}).compile(CAMERA, bar, LINK.codebook)
 
 
 def test_extremes_of_both_sides_and_outliers_are_left_out():

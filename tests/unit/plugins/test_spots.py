@@ -33,9 +33,8 @@ def events_of(rng, rate_hz, seconds, burst, noise_hz):
     x, y = x + 3 * rng.standard_normal(len(t)), y + 3 * rng.standard_normal(len(t))
     p = np.repeat(bits[edges], burst)
     n = rng.poisson(noise_hz * seconds)
-    t = np.concatenate([t, rng.uniform(0, seconds * 1e6, n)])
-    x = np.concatenate([x, rng.uniform(0, 1279, n)])
-    y = np.concatenate([y, rng.uniform(0, 719, n)])
+    noise = (rng.uniform(0, most, n) for most in (seconds * 1e6, 1279, 719))
+    t, x, y = (np.concatenate(both) for both in zip((t, x, y), noise, strict=True))
     p = np.concatenate([p, rng.integers(0, 2, n)])
     return merged(Events.of(np.floor(t), np.rint(x), np.rint(y), p))
 

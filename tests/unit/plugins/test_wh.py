@@ -45,12 +45,6 @@ def posterior(sums, codes, grid, error, min_values):
     return out
 
 
-def weighted_values(sums, probability, grid, least):
-    values = cells_of(twin_values_of(sums), grid)
-    weight = np.where(probability >= least, probability, 0)
-    return np.einsum("krc,irc->ki", weight, values)
-
-
 def twin_llr(values, words):
     """Symbols, ln P(bit 0) / P(bit 1), and share of energy explained: nearest words at the mean amplitude.
 
@@ -78,51 +72,36 @@ def take_back(sums, path):
     reach = np.abs(path).max()
     seam = np.pad(sums, ((0, 0), (reach, reach), (reach, reach)))
     _, height, width = sums.shape
-    return np.array(
-        [
-            seam[c, reach + path[c // 2, 0] :, reach + path[c // 2, 1] :][:height, :width]
-            for c in range(len(sums))
-        ]
-    )
+    places = reach + path.repeat(2, 0)
+    return np.array([one[y:, x:][:height, :width] for one, (y, x) in zip(seam, places, strict=True)])
 
 
 PROFILES = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
 SEEDS = range(2)
 CLUSTERS = 16
+SHAPE = {"cluster_px": 4, "width_px": 4}
 
 
-def values_of(chips):
-    """Bipolar values of pair codes."""
-    return chips[..., 1::2].astype(np.int8) * 2 - 1
+CODES = WhPilots().codes(CLUSTERS)[:, 1::2].astype(np.int8) * 2 - 1
 
 
-CODES = values_of(WhPilots().codes(CLUSTERS))
+def book_of(profile="wh4x2"):
+    return Codebook(profile, WhPilots().preamble(), chips_of_values(CODES), PROFILES[profile].codewords())
 
 
-def book_of(profile="wh4x2", pilots=CODES):
-    preamble, codewords = WhPilots().preamble(), PROFILES[profile].codewords()
-    return Codebook(profile, preamble, chips_of_values(pilots), codewords)
-
-
-def image_of(values, where, cell_px=2, strength=3):
-    """Sums of a bar whose cluster k fills row `where[k]` of cells with its values (K, n)."""
-    chips = chips_of_values(values)[:, :, None].astype(np.int16) * 2 - 1
-    image = np.zeros((chips.shape[1], CLUSTERS * cell_px, 3 * cell_px), np.int16)
-    for k, row in enumerate(where):
-        image[:, row * cell_px : (row + 1) * cell_px, cell_px : 2 * cell_px] = strength * chips[k][:, :, None]
-    return image
+def image_of(values):
+    """Sums of a bar whose clusters fill rows of cells of 4 px with their values (K, n)."""
+    chips = 2 * chips_of_values(values).T.astype(np.int16) - 1
+    return np.pad(3 * chips.repeat(4, 1)[:, :, None].repeat(4, 2), ((0, 0), (0, 0), (4, 4)))
 
 
 def random_sums(rng, shape, density=0.5):
     return (rng.integers(-3, 4, shape) * (rng.random(shape) < density)).astype(np.int16)
 
 
-def presence_of(rng, clusters, rows, columns, grid):
-    probability = np.where(
-        rng.random((clusters, rows, columns)) < 0.3, rng.random((clusters, rows, columns)), 0
-    )
-    probability = probability.astype(np.float32)
-    return PresenceMap(probability, grid, probability > 0.5, np.zeros(0, np.float32))
+def presence_of(rng, *shape):
+    probability = np.where(rng.random(shape) < 0.3, rng.random(shape), 0).astype(np.float32)
+    return PresenceMap(probability, 2, probability > 0.5, np.zeros(0, np.float32))
 
 
 # Separation
@@ -145,28 +124,24 @@ def test_presence_is_bayes_rule(shape, grid, density):
 # Decoding
 
 
-def framed(info):
-    """A frame's sums: an empty pilot before the info segment."""
-    return np.concatenate([np.zeros_like(info), info])
-
-
 def bits_of(symbols, bits):
     return np.array([[int(b) for b in f"{s:0{bits}b}"] for s in symbols])
 
 
-@pytest.mark.parametrize("symbols", [None, 6, 7])
+@pytest.mark.parametrize("many", [None, 6, 7])
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("seed", SEEDS)
-def test_llr_is_the_brute_force_max_log(profile, seed, symbols):
+def test_llr_is_the_brute_force_max_log(profile, seed, many):
     """Of all the profile's symbols, or of so many, of which four carry bits."""
-    rng = np.random.default_rng(seed)
-    book = book_of(profile)
-    book = replace(book, codewords=book.codewords[:symbols])
+    rng, book = np.random.default_rng(seed), book_of(profile)
+    book = replace(book, codewords=book.codewords[:many])
     sums = random_sums(rng, (16, 12, 8))
-    presence = presence_of(rng, CLUSTERS, 6, 4, 2)
+    presence = presence_of(rng, CLUSTERS, 6, 4)
     presence.probability[:, 0, 0] = 0.7
-    soft = WhTransform().compile(book)(presence, framed(sums))
-    values = weighted_values(sums, presence.probability, 2, 0.01)
+    # The pilot before the info segment is empty.
+    soft = WhTransform().compile(book)(presence, np.concatenate([np.zeros_like(sums), sums]))
+    weight = np.where(presence.probability >= 0.01, presence.probability, 0)
+    values = np.einsum("krc,irc->ki", weight, cells_of(twin_values_of(sums), 2))
     symbols, llr, quality = twin_llr(values, book.codeword_edges.astype(float))
     assert_array_equal(soft.symbols, symbols)
     assert_allclose(soft.llr, llr, rtol=1e-4, atol=1e-4)
@@ -181,9 +156,7 @@ def test_learned_likelihoods_decode_every_symbol_without_negative_events(profile
     n = len(book.codewords)
     for first in range(0, n, CLUSTERS):
         symbols = np.arange(first, first + CLUSTERS) * 5 % n
-        frame = np.concatenate(
-            [image_of(CODES, range(CLUSTERS), 4), image_of(book.codeword_edges[symbols], range(CLUSTERS), 4)]
-        )
+        frame = np.concatenate([image_of(CODES), image_of(book.codeword_edges[symbols])])
         # From values to edges: events come where the light changes, not while it stays.
         light = frame > 0
         frame[1:][light[1:] == light[:-1]] = 0
@@ -200,26 +173,26 @@ def test_what_flickers_before_a_part_of_a_cluster_is_not_listened_to(decoding, m
     """Half of the columns of each cluster say what a panel does, not the bar."""
     book, rng = book_of(), np.random.default_rng(0)
     symbols = rng.integers(64, size=CLUSTERS)
-    shape = {"cluster_px": 4, "width_px": 4}
-    sums = ideal_sums(book, symbols, missing=0.3, seed=0, **shape)
+    sums = ideal_sums(book, symbols, missing=0.3, seed=0, **SHAPE)
     lit = np.abs(sums).sum(0) > 0
-    columns = np.flatnonzero(lit.any(0))[: np.ptp(np.flatnonzero(lit.any(0))) // 2 + 1]
-    flicker = rng.integers(-2, 3, len(sums))
-    sums[:, :, columns] = np.where(lit[:, columns], flicker[:, None, None], 0)
-    presence = ideal_presence(CLUSTERS, **shape)
-    soft = decoding.compile(book)(presence, sums)
-    assert_array_equal(soft.symbols, symbols)
+    seen = np.flatnonzero(lit.any(0))
+    columns = seen[: np.ptp(seen) // 2 + 1]
+    flicker = rng.integers(-2, 3, (len(sums), 1, 1))
+    sums[:, :, columns] = flicker * lit[:, columns]
+    decode = decoding.compile(book)
+    presence = ideal_presence(CLUSTERS, **SHAPE)
+    assert_array_equal(decode(presence, sums).symbols, symbols)
     monkeypatch.setattr("evlcp_wh.decoding._PIXEL_SHARE", 1 - 1e-9)
-    believing = decoding.compile(book)(presence, sums)
-    assert (believing.symbols != symbols).any()
+    assert (decoding.compile(book)(presence, sums).symbols != symbols).any()
 
 
-def drifting(book, symbols, right_down, missing=0.3, seed=0, **image):
-    """A frame of a bar that stands still while its pilot is on air and drifts away while its info is."""
-    still = ideal_sums(book, symbols, missing=missing, seed=seed, **image)
+def drifting(book, right_down, seed):
+    """Symbols, sums and path of a bar that stands still in its pilot and drifts away in its info segment."""
+    symbols = np.random.default_rng(seed).integers(len(book.codewords), size=CLUSTERS)
+    still = ideal_sums(book, symbols, missing=0.3, seed=seed, **SHAPE)
     share = np.clip((np.arange(16) - 7.5) / 7.5, 0, 1)
     path = np.rint(share[:, None] * np.array(right_down)[::-1]).astype(int)
-    return take_back(still, -path), path
+    return symbols, take_back(still, -path), path
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -227,10 +200,8 @@ def drifting(book, symbols, right_down, missing=0.3, seed=0, **image):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, seed):
     book = book_of(profile)
-    symbols = np.random.default_rng(seed).integers(len(book.codewords), size=CLUSTERS)
-    shape = {"cluster_px": 4, "width_px": 4}
-    sums, path = drifting(book, symbols, right_down, seed=seed, **shape)
-    presence = ideal_presence(CLUSTERS, **shape)
+    symbols, sums, path = drifting(book, right_down, seed)
+    presence = ideal_presence(CLUSTERS, **SHAPE)
     soft = MotionFeedback().compile(book)(presence, sums)
     assert_array_equal(soft.symbols, symbols)
     assert_array_equal(soft.llr < 0, bits_of(symbols, book.bits_per_symbol) == 1)
@@ -249,10 +220,8 @@ def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, s
 def test_a_bar_that_goes_farther_than_is_searched_is_searched_farther(right_down, seed):
     """At the border the path ends, and what lies beyond is read as the clusters beside."""
     book = book_of()
-    symbols = np.random.default_rng(seed).integers(len(book.codewords), size=CLUSTERS)
-    shape = {"cluster_px": 4, "width_px": 4}
-    sums, _ = drifting(book, symbols, right_down, seed=seed, **shape)
-    presence = ideal_presence(CLUSTERS, **shape)
+    symbols, sums, _ = drifting(book, right_down, seed)
+    presence = ideal_presence(CLUSTERS, **SHAPE)
     soft = MotionFeedback().compile(book)(presence, sums)
     assert_array_equal(soft.symbols, symbols)
     far = MotionFeedback(reach_px=8).compile(book)(presence, sums)

@@ -25,6 +25,12 @@ def received(link, events, cuts=(), **options):
     return receiver, packets + receiver.close()
 
 
+def steps(events, until_us):
+    """The events of each millisecond, after its start, us."""
+    bounds = events.t_us.searchsorted(np.arange(0, until_us + 1, 1000))
+    return ((1000 * n, events[a:b]) for n, (a, b) in enumerate(pairwise(bounds)))
+
+
 def frames_of(packets):
     return [frame for packet in packets for frame in packet.frames]
 
@@ -69,9 +75,8 @@ def lamp_events(x, y, size, flicker_hz, duration_us, *, duty=0.5):
     n = v.size * 3
     t = np.repeat(edges, n) + np.tile(np.repeat([0, 12, 24], v.size), len(edges))
     t = np.floor(t + rng.normal(25, 5, len(t)))
-    order = np.argsort(t, kind="stable")
-    columns = (t, np.tile(u.ravel(), 3 * len(edges)), np.tile(v.ravel(), 3 * len(edges)), np.repeat(on, n))
-    return Events.of(*(c[order] for c in columns))
+    places = (np.tile(one.ravel(), 3 * len(edges)) for one in (u, v))
+    return Events.of(t, *places, np.repeat(on, n))[np.argsort(t, kind="stable")]
 
 
 def noise_events(rate_hz, duration_us):

@@ -41,8 +41,8 @@ def lock_of(form, packet, late_us=0.0, delay_us=-20.0):
 def due_until(grid, until_us):
     found = []
     while (due := grid.due(until_us)) is not None:
-        found.append(due)
         grid.go_to(due.number + 1)
+        found.append(due)
     return found
 
 
@@ -121,8 +121,7 @@ EVENTS = ideal_events(LINK, BAR)
 def read_late(events, row_us, centre_px=BAR.y_px):
     """The events of a bar whose rows are read one after another."""
     t_us = np.rint(events.t_us + row_us * (events.y.astype(float) - centre_px)).astype(np.int64)
-    order = np.argsort(t_us, kind="stable")
-    return Events.of(t_us[order], events.x[order], events.y[order], events.p[order])
+    return Events.of(t_us, events.x, events.y, events.p)[np.argsort(t_us, kind="stable")]
 
 
 def measured(events, height_px=HEIGHT_PX):
@@ -153,15 +152,12 @@ def test_nothing_to_see_is_nothing_known(events):
 
 
 def test_packets_are_averaged_and_changes_followed():
-    rng = np.random.default_rng(1)
-    known = RowDelay()
-    for _ in range(30):
-        known = known.measured(0.2 + rng.normal(0, 0.03), 0.03)
-    assert known.row_us == pytest.approx(0.2, abs=0.03)
-    assert known.variance < 0.03**2
-    for _ in range(30):
-        known = known.measured(0.1 + rng.normal(0, 0.03), 0.03)
-    assert known.row_us == pytest.approx(0.1, abs=0.04)
+    rng, known = np.random.default_rng(1), RowDelay()
+    for row_us, within in ((0.2, 0.03), (0.1, 0.04)):
+        for _ in range(30):
+            known = known.measured(row_us + rng.normal(0, 0.03), 0.03)
+        assert known.row_us == pytest.approx(row_us, abs=within)
+        assert known.variance < 0.03**2
 
 
 @pytest.mark.parametrize("row_us", [-0.25, 0.25])

@@ -12,13 +12,6 @@ from evlcp_sdk.values import Events
 
 WIDTH, HEIGHT = 24, 16
 SEEDS = range(5)
-CHIP_US = 100.0
-
-
-def random_events(rng, n, step_us=3, width=WIDTH, height=HEIGHT):
-    """Events in order; many share their time."""
-    t = 1000 + rng.integers(0, step_us + 1, n).cumsum()
-    return Events.of(t, rng.integers(0, width, n), rng.integers(0, height, n), rng.integers(0, 2, n))
 
 
 def states(rose_us, time, score, same=0):
@@ -28,7 +21,7 @@ def states(rose_us, time, score, same=0):
     return (clock | again | np.asarray(time) << _kernels.TIME_AT | score).astype(np.uint32)
 
 
-def rhythm_of(pixels, chip_us=CHIP_US, min_score=8):
+def rhythm_of(pixels, chip_us=100.0, min_score=8):
     rhythm = Rhythm(WIDTH, HEIGHT, chip_us, min_score)
     rhythm._pixels, rhythm._seen = pixels, 0
     return rhythm
@@ -80,7 +73,9 @@ def test_a_bar_is_measured_beside_light_that_is_everywhere():
 @pytest.mark.parametrize("n", [0, 1, 500])
 def test_events_in_boxes(n):
     rng = np.random.default_rng(n)
-    events, score, same = random_events(rng, n), rng.integers(0, 41, (HEIGHT, WIDTH)), rng.integers(0, 32)
+    score, same = rng.integers(0, 41, (HEIGHT, WIDTH)), rng.integers(0, 32)
+    times = 1000 + rng.integers(0, 4, n).cumsum()
+    events = Events.of(times, *(rng.integers(0, most, n) for most in (WIDTH, HEIGHT, 2)))
     in_rhythm = ((score >= 20) & (same < 14))[events.y, events.x]
     rhythm = rhythm_of(states(np.zeros(score.shape, int), 0, score, same), min_score=20)
     boxes = [(0, 0, WIDTH, HEIGHT), (0, 0, 1, 1), (3, 2, 17, 9), (10, 5, WIDTH, HEIGHT), (4, 4, 4, 9)]

@@ -10,14 +10,12 @@ from rx_streams import LINK, frames_of, received
 
 from evlcp_sdk.files import shipped
 from evlcp_sdk.io import read_events
-from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.rx.placement import layout_of, placements
 from evlcp_sdk.rx.points import points_finder
-from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.sim import Simulation, load_scene
 from evlcp_sdk.sim.motion import project
-from evlcp_sdk.values import PresenceMap, changed
+from evlcp_sdk.values import Events, PresenceMap, changed
 
 BAR = BarLayout()
 CENTRES = BAR.cluster_centres_m()
@@ -25,8 +23,7 @@ FINE = 8
 """Parts that a pixel's side is cut into to draw with."""
 
 
-def drawn(layout, turn, shift, half_m,
-          size):  # fmt: skip
+def drawn(layout, turn, shift, half_m, size):
     """Clusters as boxes of `half_m`, each pixel with its share of each: an ideal image."""
     width, height = size
     y, x = (np.mgrid[: height * FINE, : width * FINE] + 0.5) / FINE - 0.5
@@ -39,63 +36,53 @@ def drawn(layout, turn, shift, half_m,
     return PresenceMap(cells.astype(np.float32), 2, cells, pixels)
 
 
-def points_of(presence, centres_m=CENTRES):
+def points_of(presence, centres_m=CENTRES, at_px=(0.0, 0.0), pixels=None, **placed):
+    """Points, sigmas, their time and the centre, by pilots of which each has an edge of its own."""
     layout = layout_of(centres_m)
-    return points_finder(layout, *alone(len(centres_m)))(
-        presence, placements(presence, layout)[0], heard_of(presence.pixels), (0.0, 0.0)
-    )[:2]
-
-
-def alone(clusters):
-    """Pilots of which each has one edge, at which no other has one."""
-    return np.eye(clusters, dtype=np.int64), 1
-
-
-def heard_of(light):
-    """Polarity sums of such pilots, in hundreds of a pixel's light."""
-    return np.concatenate([np.zeros((1, *light.shape[1:]), np.int16), np.rint(100 * light).astype(np.int16)])
+    light = np.rint(100 * presence.pixels).astype(np.int16)
+    heard = np.concatenate([np.zeros_like(light[:1]), light])
+    placement = replace(placements(presence, layout)[0], **placed)
+    seen = presence if pixels is None else changed(presence, pixels=pixels)
+    return points_finder(layout, np.eye(len(light), dtype=np.int64), 1)(seen, placement, heard, at_px)
 
 
 def truth_of(turn, shift, layout):
-    z = turn * (layout[:, 0] + 1j * layout[:, 1]) + shift
+    z = turn * (layout @ [1, 1j]) + shift
     return np.stack([z.real, z.imag], -1)
 
 
 @settings(max_examples=25)
-@given(st.floats(75, 220), st.floats(-0.15, 0.15), st.floats(0, 1), st.floats(0, 1))
-def test_points_of_an_ideal_bar(px_per_m, roll, dx, dy):
-    turn, shift = px_per_m * np.exp(1j * roll), complex(24 + dx, 112 + dy)
-    presence = drawn(CENTRES, turn, shift, np.array([1.2 / px_per_m, 0.03]), (48, 224))
-    points, sigma = points_of(presence)
-    want = truth_of(turn, shift, CENTRES)
-    assert np.abs(points - want).max() < 0.2
+@given(st.floats(75, 220), st.floats(-0.15, 0.15), st.integers(0, FINE), st.integers(0, FINE))
+def test_points_of_an_ideal_bar(px_per_m, roll, right, down):
+    turn, shift = px_per_m * np.exp(1j * roll), 24 + 112j + complex(right, down) / FINE
+    presence = drawn(CENTRES, turn, shift, (1.2 / px_per_m, 0.03), (48, 224))
+    points, sigma, *_ = points_of(presence)
+    off = points - truth_of(turn, shift, CENTRES)
+    assert np.abs(off).max() < 0.2
     # Drawn in eighths of a pixel.
-    assert np.sqrt(np.mean((points - want) ** 2)) < 0.08
+    assert np.sqrt(np.mean(off**2)) < 0.08
     assert (sigma[1:-1] < 0.12).all()
     assert_allclose(sigma[[0, -1]], 1.5 * sigma[1])
     assert (sigma[[0, -1]] > sigma[1]).all()
 
 
-def test_a_lying_bar_and_one_upside_down():
-    for turn in (-150.0 + 0j, 150j, -150j):
-        size = (48, 200) if turn.real else (200, 48)
-        shift = complex(size[0] / 2 + 0.3, size[1] / 2 - 0.2)
-        presence = drawn(CENTRES, turn, shift, np.array([0.008, 0.03]), size)
-        points, _ = points_of(presence)
-        assert np.abs(points - truth_of(turn, shift, CENTRES)).max() < 0.2
+@pytest.mark.parametrize("turn", [-150.0, 150j, -150j])
+def test_a_lying_bar_and_one_upside_down(turn):
+    size = (200, 48) if turn.imag else (48, 200)
+    shift = complex(size[0] / 2 + 0.3, size[1] / 2 - 0.2)
+    points, *_ = points_of(drawn(CENTRES, turn, shift, (0.008, 0.03), size))
+    assert np.abs(points - truth_of(turn, shift, CENTRES)).max() < 0.2
 
 
 def test_dark_clusters_are_unseen_and_cells_out_of_place_are_left_out():
-    presence = drawn(CENTRES, 150, 24.3 + 100.4j, np.array([0.008, 0.03]), (48, 200))
-    want = truth_of(150, 24.3 + 100.4j, CENTRES)
-    selected, pixels = presence.selected.copy(), presence.pixels.copy()
+    presence = drawn(CENTRES, 150, 24.3 + 100.4j, (0.008, 0.03), (48, 200))
+    selected, pixels = presence.selected, presence.pixels
     selected[4], pixels[4] = False, 0
     selected[9, 5:8, 2], pixels[9, 10:16, 4:6] = True, 0.9
-    points, sigma = points_of(PresenceMap(presence.probability, 2, selected, pixels))
-    assert np.isnan(points[4]).all()
-    assert np.isnan(sigma[4])
-    others = np.arange(16) != 4
-    assert np.abs(points - want)[others].max() < 0.2
+    points, sigma, *_ = points_of(presence)
+    assert np.isnan([*points[4], sigma[4]]).all()
+    off = np.delete(points - truth_of(150, 24.3 + 100.4j, CENTRES), 4, axis=0)
+    assert np.abs(off).max() < 0.2
     assert sigma[3] > sigma[2]
 
 
@@ -105,58 +92,47 @@ def test_a_panel_has_neighbours_on_both_axes(down):
     layout = panel.cluster_centres_m()
     turn, shift = 700 * np.exp(0.05j), 64.2 + 63.7j
     shown = layout * [1, down]
-    presence = drawn(shown, turn, shift, np.array([0.02, 0.02]), (128, 128))
-    points, _ = points_of(presence, layout)
+    presence = drawn(shown, turn, shift, (0.02, 0.02), (128, 128))
+    points, *_ = points_of(presence, layout)
     assert np.abs(points - truth_of(turn, shift, shown)).max() < 0.25
 
 
 def test_two_clusters_give_no_points():
-    presence = drawn(CENTRES, 150, 24 + 100j, np.array([0.008, 0.03]), (48, 200))
-    layout = layout_of(CENTRES)
-    placement = replace(placements(presence, layout)[0], seen=np.arange(16) < 2)
-    heard = heard_of(presence.pixels)
-    points, sigma, _, centre_px = points_finder(layout, *alone(16))(presence, placement, heard, (3.0, 5.0))
-    assert np.isnan(points).all()
-    assert np.isnan(sigma).all()
+    presence = drawn(CENTRES, 150, 24 + 100j, (0.008, 0.03), (48, 200))
+    points, sigma, _, centre_px = points_of(presence, at_px=(3.0, 5.0), seen=np.arange(16) < 2)
     assert points.shape == (16, 2)
-    assert centre_px == (placement.shift.real + 3, placement.shift.imag + 5)
+    assert np.isnan([*points.T, sigma]).all()
+    assert centre_px == pytest.approx((24 + 3, 100 + 5), abs=1)
 
 
 @settings(max_examples=25)
 @given(st.floats(0, 2))
 def test_cells_that_hold_more_of_one_side_do_not_shift_a_bar(dx):
-    turn, shift = 150.0, complex(24 + dx, 100)
-    whole = drawn(CENTRES, turn, shift, np.array([2.6 / turn, 0.03]), (48, 200))
-    first = 2 * int((24 + dx - 2) / 2)
+    whole = drawn(CENTRES, 150.0, complex(24 + dx, 100), (2.6 / 150, 0.03), (48, 200))
+    first, want = 2 * int((24 + dx - 2) / 2), (24 + dx + 8, 100 + 2)
     pixels = whole.pixels.copy()
     pixels[:, :, :first] = pixels[:, :, first + 4 :] = 0
-    layout = layout_of(CENTRES)
-    points, _, _, centre_px = points_finder(layout, *alone(16))(
-        changed(whole, pixels=pixels), placements(whole, layout)[0], heard_of(whole.pixels), (8.0, 2.0)
-    )
+    points, _, _, centre_px = points_of(whole, at_px=(8.0, 2.0), pixels=pixels)
     # As drawn, an edge is right to half a part of a pixel.
-    assert np.abs(points[:, 0] - shift.real - 8).max() <= 0.5 / FINE
-    assert np.abs(np.subtract(centre_px, (shift.real + 8, shift.imag + 2))).max() <= 0.5 / FINE
+    assert np.abs(points[:, 0] - want[0]).max() <= 0.5 / FINE
+    assert np.abs(np.subtract(centre_px, want)).max() <= 0.5 / FINE
 
 
 def lies(points):
     """Whether a bar is wider than it is high."""
-    return bool(np.ptp(points[:, 0]) > np.ptp(points[:, 1]))
+    return np.ptp(points[:, 0]) > np.ptp(points[:, 1])
 
 
-def simulated(scene, sets, seed=None, lying=False, **link):
+def simulated(scene, sets, seed=None, lying=False):
     """By how much points of a scene's upright or lying bar are off its truth, px, (frames, K, 2)."""
     simulation = Simulation(load_scene(scene, sets), seed)
-    receiver = Receiver(resolve(link))
-    packets = [p for events in simulation.stream() for p in receiver.feed(events)] + receiver.close()
-    points = [f.points_px for p in packets for f in p.frames]
-    t_us = np.array([f.points_t_us for p in packets for f in p.frames])
-    mine = [np.isfinite(seen).all() and lies(seen) == lying for seen in points]
+    frames = frames_of(received(LINK, Events.concat(list(simulation.stream())))[1])
+    mine = [f for f in frames if np.isfinite(f.points_px).all() and lies(f.points_px) == lying]
     bars = [bar.strips[0].strip.cuts_m() for bar in simulation.bars]
     cuts = next(cuts for cuts in bars if lies(cuts) == lying)
-    at = simulation.path.at(t_us[mine] - simulation.scene.t0_us)
+    at = simulation.path.at(np.array([f.points_t_us for f in mine]) - simulation.scene.t0_us)
     want, _ = project((cuts[1:] + cuts[:-1]) / 2, *at, simulation.scene.camera)
-    return np.array(points)[mine] - want
+    return np.array([f.points_px for f in mine]) - want
 
 
 def test_the_image_of_a_still_bar_is_found_at_any_place_within_pixels():
@@ -192,12 +168,11 @@ def test_sigma_is_the_scatter_about_the_similarity():
     squares, freedom = 0.0, 0
     for frame in frames_of(received(LINK, read_events(shipped("recordings", "night-50m-30kmh-cut.raw")))[1]):
         seen = np.isfinite(frame.points_px[:, 0])
-        z = frame.points_px[seen] @ [1, 1j]
-        c = CENTRES[seen] @ [1, 1j]
+        z, c = (one[seen] @ [1, 1j] for one in (frame.points_px, CENTRES))
         w = 1 / frame.points_sigma_px[seen]
         a = np.stack([c, np.ones_like(c)], 1) * w[:, None]
         left = z * w - a @ np.linalg.lstsq(a, z * w)[0]
-        squares += float((np.abs(left) ** 2).sum())
+        squares += (np.abs(left) ** 2).sum()
         freedom += 2 * len(z) - 4
     # Along and across errors differ, and neighbours share a boundary: the mean counts, not the exact law.
     assert 0.5 < squares / freedom < 1.5

@@ -1,11 +1,12 @@
 """The whole receiver on ideal recordings: what it must decode, and what it leaves alone."""
 
+from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from rx_streams import LINK, frames_of, noise_events, received, right_frames
+from rx_streams import LINK, frames_of, noise_events, received, right_frames, said
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import load_link
@@ -15,7 +16,7 @@ from evlcp_sdk.rx.framing import SkippedFrame
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
-from evlcp_sdk.values import Events, PresenceMap
+from evlcp_sdk.values import Events, PresenceMap, changed
 
 
 def packets_of(bar, link=LINK):
@@ -85,13 +86,13 @@ def test_a_bar_in_the_dark(every, first, end, given_, count):
     bar = IdealBar(random_symbols(link, 3))
     events = ideal_events(link, bar)
     chips = [frame_chip(link, 1, frame) + more for frame, more in (first, end)]
-    probe = Probe()
+    probe = Probe(list)
     hook = Registry.load(probe).hook
     receiver, packets = received(link, events[~between(events, bar, *chips)], hook=hook)
     assert [f.frame for f in packets[1].frames] == given_
     why = next(name for name, many in count.items() if many)
     missing = [n for n in range(10) if n not in given_]
-    skipped = [one for one in probe.seen["skipped"] if isinstance(one, SkippedFrame)]
+    skipped = [one for one in probe["skipped"] if isinstance(one, SkippedFrame)]
     assert [(one.transmitter, one.packet, one.frame, one.why) for one in skipped] == [
         (0, 1, n, why) for n in missing
     ]
@@ -131,7 +132,7 @@ def test_a_step_of_light_costs_the_frame_that_it_drowns(drowned, start_us, which
     assert receiver.counts["frames_flooded"] == int(drowned)
 
 
-@pytest.mark.parametrize("sooner_us", [30, 45, 60])
+@pytest.mark.parametrize("sooner_us", [30, 60])
 def test_events_that_come_sooner_in_brighter_light(sooner_us):
     """From a frame on, well before the next preamble, and half as many."""
     bar = IdealBar(random_symbols(LINK, 3))
@@ -170,15 +171,6 @@ def test_a_frame_that_the_end_cuts_is_not_given():
         assert receiver.counts["frames_at_end"] == cut, after_us
 
 
-def test_distance_is_that_of_the_spacing():
-    bar = IdealBar(random_symbols(LINK, 3), cluster_px=9.0)
-    ranges = [f.range for f in frames_of(packets_of(bar))]
-    want = LINK.camera.focal_px * 0.06 / 9.0
-    # Whole pixels, still bar: every cluster's map is the same, so the shift is exact.
-    assert_allclose([r.distance_m for r in ranges], want, rtol=2e-3)
-    assert all(r.sigma_m < 0.005 * want for r in ranges)
-
-
 @pytest.mark.parametrize(("shake_px", "shake_hz"), [(16, 15), (60, 15), (250, 5)])
 def test_a_bar_that_sweeps_from_the_first_frame_on(shake_px, shake_hz):
     """Round in a circle at 1.5, 5.7 and 7.9 px/ms: in any direction, along the bar and across it."""
@@ -214,15 +206,19 @@ def test_random_blinking_at_the_chip_rate_is_no_transmitter():
 
 
 def test_a_dark_cluster_costs_only_itself():
-    bar = IdealBar(random_symbols(LINK, 2))
+    """And the distance is that of the spacing."""
+    bar = IdealBar(random_symbols(LINK, 2), cluster_px=9.0)
     events = ideal_events(LINK, bar)
-    top = 350.7 - 64 + 5 * 8
-    lit = (events.y < np.floor(top)) | (events.y > np.ceil(top + 8))
-    frames = frames_of(received(LINK, events[lit])[1])
-    assert len(frames) == 20
-    for f, want in zip(frames, bar.symbols.reshape(-1, 16), strict=True):
-        assert np.delete(f.soft.symbols, 5).tolist() == np.delete(want, 5).tolist()
-        assert f.range.distance_m == pytest.approx(LINK.camera.focal_px * 0.06 / 8, rel=5e-3)
+    top = 350.7 - 72 + 5 * 9
+    lit = (events.y < np.floor(top)) | (events.y > np.ceil(top + 9))
+    for kept, px, rel in ((lit, 5, 5e-3), (lit | True, [], 2e-3)):
+        frames = frames_of(received(LINK, events[kept])[1])
+        assert len(frames) == 20
+        for f, want in zip(frames, bar.symbols.reshape(-1, 16), strict=True):
+            assert np.delete(f.soft.symbols, px).tolist() == np.delete(want, px).tolist()
+            true_m = LINK.camera.focal_px * 0.06 / 9
+            assert f.range.distance_m == pytest.approx(true_m, rel=rel)
+            assert f.range.sigma_m < 0.005 * true_m
 
 
 def test_a_bar_in_pieces_too_small_to_place_is_put_together():
@@ -311,11 +307,9 @@ def test_a_frame_says_the_same_at_any_time_of_the_clock(t0_us):
     for one, other in zip(received(LINK, STREAM)[1], later, strict=True):
         assert abs(other.t_us - t0_us - one.t_us) <= 0.25
         for a, b in zip(one.frames, other.frames, strict=True):
-            assert (a.transmitter, a.range, a.x_px) == (b.transmitter, b.range, b.x_px)
-            assert a.soft.symbols.tolist() == b.soft.symbols.tolist()
-            assert_allclose(b.points_px, a.points_px, rtol=0)
-            assert abs(b.t_us - t0_us - a.t_us) <= 0.25
-            assert abs(b.points_t_us - t0_us - a.points_t_us) <= 0.25
+            times = {name: getattr(b, name) - t0_us for name in ("t_us", "points_t_us")}
+            assert times == pytest.approx({name: getattr(a, name) for name in times}, abs=0.25, rel=0)
+            assert said(changed(b, **{name: getattr(a, name) for name in times})) == said(a)
 
 
 def test_what_is_dropped_is_counted():
@@ -345,32 +339,27 @@ def test_a_camera_that_restarts_its_clock_is_heard_again(back_us):
     assert right_frames(packets[2:], bar, t0_us=late_us - back_us) == 20
 
 
-class Probe:
+class Probe(defaultdict):
     """Values of the stages that finish."""
-
-    def __init__(self):
-        self.seen = {}
 
     @hookimpl
     def evlcp_stage_finished(self, stage, value, elapsed_s):
         assert elapsed_s >= 0
-        self.seen.setdefault(stage, []).append(value)
+        self[stage].append(value)
 
 
 @pytest.mark.parametrize("width_px", [1, 2, 5, 6])
 def test_probes_see_every_stage(width_px):
     """A thin bar stands in the middle of a cell."""
-    probe = Probe()
+    probe = Probe(list)
     bar = IdealBar(random_symbols(LINK, 2), width_px=width_px, x_px=400.0)
     received(LINK, ideal_events(LINK, bar), hook=Registry.load(probe).hook)
-    many = {stage: len(values) for stage, values in probe.seen.items()}
-    assert many["frame"] == many["ranging"] == many["decoding"] == many["view"] == 20
-    assert many["synchronization"] == 2
-    assert many["regions"] >= 40
-    assert many["separation"] >= 20
-    for presence in probe.seen["separation"]:
+    assert {len(probe[stage]) for stage in ("frame", "ranging", "decoding", "view")} == {20}
+    assert len(probe["synchronization"]) == 2
+    assert len(probe["regions"]) >= 40
+    assert len(probe["separation"]) >= 20
+    for presence in probe["separation"]:
         assert isinstance(presence, PresenceMap)
         # As many cells on its left as on its right.
         assert presence.selected.shape[2] % 2 == 1
-        if width_px <= 2:
-            assert presence.selected.any((0, 1)).sum() <= 3
+        assert width_px > 2 or presence.selected.any((0, 1)).sum() <= 3

@@ -5,12 +5,10 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from rx_streams import LINK, frames_of, received
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.reflections import FrameDetection, Reflections, repeats
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, Frame, Range, SoftSymbols
@@ -18,21 +16,18 @@ from evlcp_sdk.values import Events, Frame, Range, SoftSymbols
 FORMAT = PacketFormat()
 PERIOD_US = FORMAT.packet_chips * FORMAT.chip_us
 CODEWORDS = 64
-Symbols = NDArray[np.int64]
 
 
-def sighting(
-    transmitter, number, symbols, *, late_us=0.0, y_px=300.0, x_px=None, light=100.0, mirrored=False
-):
+def sighting(transmitter, number, symbols=None, *, late_us=0.0, x_px=None, light=100.0, **more):
     """The frame of a number since the start."""
+    symbols = said(number) if symbols is None else symbols
     packet, index = divmod(number, FORMAT.frames)
     t_us = packet * PERIOD_US + FORMAT.frame_start_chip(index) * FORMAT.chip_us + late_us
     soft = SoftSymbols(symbols, np.zeros((len(symbols), 6), np.float32), 1.0)
-    none = Range(math.nan, math.nan, 0)
-    x_px = 400.0 + 40 * transmitter if x_px is None else x_px
-    frame = Frame(transmitter, packet, index, t_us, soft, none, None, x_px, y_px)
+    place = 400.0 + 40 * transmitter if x_px is None else x_px, more.get("y_px", 300.0)
+    frame = Frame(transmitter, packet, index, t_us, soft, Range(math.nan, math.nan, 0), None, *place)
     times = t_us, t_us + 3200, packet * PERIOD_US, FORMAT.chip_us
-    return FrameDetection(frame, *times, light, int((symbols >= 0).sum()), mirrored)
+    return FrameDetection(frame, *times, light, int((symbols >= 0).sum()), more.get("mirrored", False))
 
 
 def said(number, seed=0):
@@ -42,10 +37,8 @@ def said(number, seed=0):
 
 def misread(symbols, right, rng):
     """Symbols of which so many are right, at random places."""
-    wrong = rng.permutation(len(symbols))[right:]
-    found = symbols.copy()
-    found[wrong] = (found[wrong] + rng.integers(1, CODEWORDS, len(wrong))) % CODEWORDS
-    return found
+    wrong = rng.permutation(np.arange(len(symbols)) >= right)
+    return (symbols + wrong * rng.integers(1, CODEWORDS, len(symbols))) % CODEWORDS
 
 
 @pytest.mark.parametrize(("codewords", "clusters"), [(64, 16), (16, 16), (256, 16), (64, 2), (2, 16)])
@@ -54,11 +47,9 @@ def test_evidence_is_the_likelihood_ratio_of_the_two_models(codewords, clusters)
     rng = np.random.default_rng(1)
     for _ in range(20):
         one, other = rng.integers(-1, min(codewords, 4), (2, clusters))
-        ratio = 0.0
-        for a, b in zip(one, other, strict=True):
-            if a >= 0 and b >= 0:
-                likely = [share * (a == b) + (1 - share) / codewords for share in (1 / 4, 1 / 32)]
-                ratio += math.log(likely[0] / likely[1])
+        both, same = (one >= 0) & (other >= 0), one == other
+        likely, chance = (share * same + (1 - share) / codewords for share in (1 / 4, 1 / 32))
+        ratio = np.log(likely / chance)[both].sum()
         assert repeats(one, other, codewords) == pytest.approx(ratio, abs=1e-9)
 
 
@@ -84,11 +75,8 @@ def test_independent_payloads_are_never_taken_for_one():
 def test_the_first_frame_is_enough_where_half_of_it_is_right(right, frames):
     rng = np.random.default_rng(3)
     for _ in range(20):
-        steps = [
-            [sighting(0, n, said(n)), sighting(1, n, misread(said(n), right, rng), light=70)]
-            for n in range(frames)
-        ]
-        assert judged(*steps) == {1: 0}
+        images = [sighting(1, n, misread(said(n), right, rng), light=70) for n in range(frames)]
+        assert judged(*([sighting(0, n), image] for n, image in enumerate(images))) == {1: 0}
 
 
 @pytest.mark.parametrize("clusters", [8, 6])
@@ -96,7 +84,7 @@ def test_a_partial_reflection(clusters):
     """Only some clusters of the mirror image are seen: those are compared."""
     part = said(0)
     part[: 16 - clusters] = -1
-    assert judged([sighting(0, 0, said(0)), sighting(1, 0, part, light=70)]) == {1: 0}
+    assert judged([sighting(0, 0), sighting(1, 0, part, light=70)]) == {1: 0}
     # As bright as the bar, whichever is first.
     assert judged([sighting(0, 0, part), sighting(1, 0, said(0))]) == {0: 1}
     # What is hidden of the one is all that is seen of the other: nothing is known.
@@ -106,24 +94,19 @@ def test_a_partial_reflection(clusters):
 
 def test_frames_at_other_times_are_not_compared():
     echoes = Reflections(FORMAT, CODEWORDS)
-    steps = [[sighting(0, n, said(n)), sighting(1, n, said(n), late_us=60)] for n in range(20)]
-    assert judged(*steps, echoes=echoes) == {}
+    assert judged(*([sighting(0, n), sighting(1, n, late_us=60)] for n in range(20)), echoes=echoes) == {}
     # The lower of two images is read later: 150 rows of 0.2 us are 30 us.
-    lower = sighting(2, 20, said(20), late_us=75, y_px=450, light=70)
-    assert judged([sighting(0, 20, said(20)), lower], echoes=echoes) == {2: 0}
+    lower = sighting(2, 20, late_us=75, y_px=450, light=70)
+    assert judged([sighting(0, 20), lower], echoes=echoes) == {2: 0}
 
 
-@pytest.mark.parametrize("order", list(permutations(range(3))))
-def test_a_bar_with_two_reflections(order):
+@pytest.mark.parametrize(("bar", "road", "rail"), list(permutations(range(3))))
+def test_a_bar_with_two_reflections(bar, road, rail):
     """In whatever order they are numbered and come: both are reflections of the bar, none of the other."""
-    bar, road, rail = order
     echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(3):
-        seen = [
-            sighting(road, n, said(n), late_us=30, y_px=450, light=130, mirrored=True),
-            sighting(bar, n, said(n)),
-            sighting(rail, n, said(n), late_us=4, light=72),
-        ]
+        of_road = sighting(road, n, late_us=30, y_px=450, light=130, mirrored=True)
+        seen = [of_road, sighting(bar, n), sighting(rail, n, late_us=4, light=72)]
         assert judged(seen[::-1] if n == 1 else seen, echoes=echoes) == {road: bar, rail: bar}
 
 
@@ -134,22 +117,17 @@ def test_two_bars_with_a_reflection_each():
 
 @pytest.mark.parametrize(("off_px", "found"), [(0.0, {}), (4.0, {}), (6.0, {1: 0})])
 def test_one_image_seen_by_two_regions_is_no_reflection(off_px, found):
-    assert found == judged(
-        *(
-            [sighting(0, n, said(n), x_px=400.0), sighting(1, n, said(n), x_px=400.0 + off_px)]
-            for n in range(10)
-        )
-    )
+    seen = ([sighting(k, n, x_px=400.0 + off_px * k) for k in (0, 1)] for n in range(10))
+    assert judged(*seen) == found
 
 
 @pytest.mark.parametrize("light", [100.0, 85.0, 50.0, 30.0])
 def test_the_verdict_is_stable(light):
     """Frame by frame, now the one has more light, now the other."""
-    rng, echoes = np.random.default_rng(5), Reflections(FORMAT, CODEWORDS)
-    verdicts = []
+    rng, echoes, verdicts = np.random.default_rng(5), Reflections(FORMAT, CODEWORDS), []
     for n in range(200):
-        other = sighting(1, n, said(n), light=light * math.exp(rng.normal(0, 0.15)))
-        verdicts.append(judged([sighting(0, n, said(n)), other], echoes=echoes))
+        other = sighting(1, n, light=light * math.exp(rng.normal(0, 0.15)))
+        verdicts.append(judged([sighting(0, n), other], echoes=echoes))
     assert sum(a != b for a, b in pairwise(verdicts)) <= 1
     assert all(verdict == verdicts[10] for verdict in verdicts[10:])
     assert len(verdicts[10]) == 1
@@ -158,29 +136,28 @@ def test_the_verdict_is_stable(light):
 
 @pytest.mark.parametrize("light", [70, 150, 500])
 def test_light_tells_the_bar_unless_one_stands_upside_down(light):
-    assert judged(
-        *([sighting(0, n, said(n), light=light, mirrored=True), sighting(1, n, said(n))] for n in range(5))
-    ) == {0: 1}
+    seen = ([sighting(0, n, light=light, mirrored=True), sighting(1, n)] for n in range(5))
+    assert judged(*seen) == {0: 1}
 
 
 def test_a_bar_that_appears_after_its_reflection_takes_its_place():
     echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(12):
-        seen = [sighting(0, n, said(n), light=60, mirrored=True), sighting(1, n, said(n), light=100)]
+        seen = [sighting(0, n, light=60, mirrored=True), sighting(1, n)]
         assert judged(seen[:1] if n < 10 else seen, echoes=echoes) == ({} if n < 10 else {0: 1})
     # A weaker reflection that comes later changes nothing.
-    last = [sighting(k, 12, said(12), light=light) for k, light in ((0, 60), (1, 100), (2, 65))]
+    last = [sighting(k, 12, light=light) for k, light in enumerate((60, 100, 65))]
     assert judged(last, echoes=echoes) == {0: 1, 2: 1}
 
 
 def test_a_reflection_outlives_its_bar_by_a_second():
     echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(401):
-        image = sighting(1, n, said(n), light=70)
+        image = sighting(1, n, light=70)
         # The bar is in sight at first, and again at the end.
-        seen = [sighting(0, n, said(n)), image] if n in (0, 400) else [image]
-        t_us = image.t_us - sighting(1, 0, said(0)).t_us
-        assert judged(seen, echoes=echoes) == ({1: 0} if t_us <= 1e6 or n == 400 else {})
+        seen = [sighting(0, n), image] if n in (0, 400) else [image]
+        after_us = image.t_us - sighting(1, 0).t_us
+        assert judged(seen, echoes=echoes) == ({1: 0} if after_us <= 1e6 or n == 400 else {})
 
 
 def test_memory_is_bounded():
@@ -191,53 +168,37 @@ def test_memory_is_bounded():
         assert len(echoes._pairs) <= 3 + 2 * 8
 
 
-def reflected(events, *, missing):
-    """The same events 80 columns to the right, a little later, with some of them missing."""
-    kept = events[np.random.default_rng(1).random(len(events)) >= missing]
-    return Events.of(kept.t_us + 7, kept.x + 80, kept.y, kept.p)
-
-
 BAR = IdealBar(random_symbols(LINK, 3), shake_px=2.0)
 OWN = ideal_events(LINK, BAR)
 
 
-def by_side(events):
-    """Packets on the bar's side of column 440, and on the other."""
-    receiver, packets = received(LINK, events)
-    counts = receiver.counts
-    assert counts["frames"] == len(frames_of(packets))
-    assert counts["frames_reflected"] == sum(len(p.frames) for p in packets if p.echo_of is not None)
-    assert counts["packets"] == len(packets)
-    assert all(f.echo_of == p.echo_of for p in packets for f in p.frames)
-    return [p for p in packets if p.frames[0].x_px < 440], [p for p in packets if p.frames[0].x_px > 440]
-
-
 def test_a_rail_shows_the_bar_again():
     """It is lower than the bar: its image is cut. Nothing else tells events from the same ones."""
-    of_bar, of_rail = by_side(merged(OWN, reflected(OWN[OWN.y < 370], missing=0.4)))
+    part = OWN[(OWN.y < 370) & (np.random.default_rng(1).random(len(OWN)) >= 0.4)]
+    receiver, packets = received(LINK, merged(OWN, Events.of(part.t_us + 7, part.x + 80, part.y, part.p)))
+    of_bar, of_rail = ([p for p in packets if (p.frames[0].x_px > 440) == right] for right in (False, True))
     assert len(frames_of(of_bar)) == len(frames_of(of_rail)) == 30
+    counts = {name: receiver.counts[name] for name in ("packets", "frames", "frames_reflected")}
+    assert counts == {"packets": len(packets), "frames": 60, "frames_reflected": 30}
+    assert all(f.echo_of == p.echo_of for p in packets for f in p.frames)
     (bar,), (rail,) = ({p.transmitter for p in part} for part in (of_bar, of_rail))
     assert bar != rail
     assert {p.echo_of for p in of_bar} == {None}
-    assert {p.echo_of for p in of_rail} == {bar}
-    assert {p.messages for p in of_rail} == {()}
+    assert {(p.echo_of, p.messages) for p in of_rail} == {(bar, ())}
 
 
 @pytest.mark.parametrize(("share", "farther_m"), [(None, 0.0), (None, 12.0), (0.25, 0.0)])
 def test_two_bars_that_one_controller_feeds(share, farther_m):
     """Both are given, and the image that a rail shows of the one is that of either."""
     fed = {"seed": 3, "start_chip": 120.0, "ppm": 20.0}
-    bars = [fed | {"x_m": -1.5}, fed | {"x_m": 2.5, "z_m": farther_m}]
     rail = {"kind": "rail", "bar": 0, "share": share, "gap_m": 0.6}
     scene = {
         "duration_s": 0.08,
         "motion": {"distance_m": 50.0},
-        "bars": bars,
+        "bars": [fed | {"x_m": -1.5}, fed | {"x_m": 2.5, "z_m": farther_m}],
         "reflections": [rail] if share else [],
     }
-    source = evlcp.simulate(scene, seed=4)
-    receiver = Receiver(LINK)
-    packets = [packet for chunk in source.chunks() for packet in receiver.feed(chunk)] + receiver.close()
+    receiver, packets = received(LINK, Events.concat(list(evlcp.simulate(scene, seed=4).chunks())))
     sides = [[f for f in frames_of(packets) if (f.x_px > 640) == right] for right in (False, True)]
     given = [[f for f in side if f.echo_of is None] for side in sides]
     assert [len(side) for side in given] == [23, 23]

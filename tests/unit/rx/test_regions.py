@@ -1,11 +1,10 @@
 """Finding and following blinking regions."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from rx_streams import LINK, lamp_events, noise_events
+from rx_streams import LINK, lamp_events, noise_events, steps
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
@@ -28,11 +27,6 @@ def follower(spec=SPEC, **options):
     return RegionFollower(spec, CameraModel(), LINK.packet.chip_us, **options)
 
 
-def steps(events, until_us):
-    bounds = np.searchsorted(events.t_us, np.arange(0, until_us + 1, STEP_US))
-    return ((n * STEP_US, events[a:b]) for n, (a, b) in enumerate(pairwise(bounds)))
-
-
 def stepped(regions, events, until_us):
     """The regions of each step, after its start, us."""
     return ((start, regions.step(start, part)) for start, part in steps(events, until_us))
@@ -47,8 +41,7 @@ def raised(events, by_px):
 
 
 def in_order(t, x, y, p):
-    order = np.argsort(t, kind="stable")
-    return Events.of(*(np.asarray(column)[order] for column in (t, x, y, p)))
+    return Events.of(t, x, y, p)[np.argsort(t, kind="stable")]
 
 
 def test_a_bar_is_found_within_three_steps_and_measured():
@@ -86,10 +79,10 @@ def test_a_bar_that_leaves_the_image_fast_is_let_go(way):
     kalman = load_link(overrides=["tracking.id=kalman"]).algorithm("tracking").compile()
     regions = follower(position=kalman.position)
     moved_px = np.rint(9e-3 * np.maximum(BAR_EVENTS.t_us - 15_000, 0)).astype(np.int64)
-    x = BAR_EVENTS.x.astype(np.int64) + way[0] * moved_px + {1: 800, 0: 0, -1: -350}[way[0]]
-    y = BAR_EVENTS.y.astype(np.int64) + way[1] * moved_px
+    x = BAR_EVENTS.x + way[0] * moved_px + {1: 800, 0: 0, -1: -350}[way[0]]
+    y = BAR_EVENTS.y + way[1] * moved_px
     on = (x >= 0) & (x < 1280) & (y >= 0) & (y < 720)
-    seen = Events.of(BAR_EVENTS.t_us[on], x[on], y[on], BAR_EVENTS.p[on])
+    seen = Events.of(*(column[on] for column in (BAR_EVENTS.t_us, x, y, BAR_EVENTS.p)))
     found = [region for _, some in stepped(regions, seen, 160_000) for region in some]
     assert found
     assert all(region.released for region in found)
@@ -130,11 +123,8 @@ def test_bars_farther_apart_than_the_gap_are_two_regions_for_every_gap(merge_px)
 
 def test_what_fades_is_released():
     ends = 34_600
-    events = BAR_EVENTS[BAR_EVENTS.t_us < ends]
-    alive = {
-        start: [not t.released for t in found]
-        for start, found in stepped(follower(), events, ends + SPEC.fade_us + 5000)
-    }
+    seen = stepped(follower(), BAR_EVENTS[BAR_EVENTS.t_us < ends], ends + SPEC.fade_us + 5000)
+    alive = {start: [not one.released for one in found] for start, found in seen}
     (gone,) = [start for start, found in alive.items() if found == [False]]
     assert gone == pytest.approx(ends + SPEC.fade_us, abs=2 * STEP_US)
     assert alive[gone + STEP_US] == []
@@ -158,12 +148,10 @@ def test_a_lamp_of_two_chips_is_no_region(later_us):
 
 def test_a_moving_edge_is_no_region():
     """A bright post that crosses the image at 3 px/ms: each pixel sees it come and go once."""
-    column, row = (v.ravel() for v in np.meshgrid(np.arange(100, 400), np.arange(100, 500)))
-    late_us = np.array([0, 20, 40, 3000, 3020, 3040])[:, None]
-    t = ((column - 100) * 333 + late_us).ravel()
-    on = np.broadcast_to(late_us < 3000, (6, column.size)).ravel()
-    events = in_order(t, np.tile(column, 6), np.tile(row, 6), on)
-    assert not any(followed(events, 100_000).values())
+    late_us = [0, 20, 40, 3000, 3020, 3040]
+    column, row, late_us = np.meshgrid(np.arange(100, 400), np.arange(100, 500), late_us)
+    columns = (column - 100) * 333 + late_us, column, row, late_us < 3000
+    assert not any(followed(in_order(*map(np.ravel, columns)), 100_000).values())
 
 
 def test_what_a_bar_has_left_is_no_region():
@@ -198,18 +186,11 @@ def test_a_lamp_near_whole_chips_is_known_by_its_steady_time(hz, jitter_us):
 
     With a readout that many pixels wait for, the number of whole chips changes, too.
     """
-    rng = np.random.default_rng(hz)
-    column, row = (v.ravel() for v in np.meshgrid(np.arange(300, 320), np.arange(200, 220)))
-    t = np.arange(100, 40_000, 1e6 / hz)[:, None]
-    t = t + rng.normal(0, jitter_us, (len(t), 400))
-    events = in_order(
-        t.ravel().astype(np.int64), np.tile(column, len(t)), np.tile(row, len(t)), t.ravel() > 0
-    )
-    rhythm = Rhythm(1280, 720, LINK.packet.chip_us, SPEC.min_score)
-    for start, part in steps(events, 40_000):
-        rhythm.step(start, part, np.zeros((180, 320), np.int16), 2)
-        if start >= 20_000:
-            assert len(rhythm.of(part)) < 0.15 * len(part)
+    at, column, row = np.meshgrid(np.arange(100, 40_000, 1e6 / hz), np.arange(300, 320), np.arange(200, 220))
+    t = (at + np.random.default_rng(hz).normal(0, jitter_us, at.shape)).astype(np.int64)
+    events = in_order(*map(np.ravel, (t, column, row, t > 0)))
+    for start, heard, part in in_rhythm(events, 40_000):
+        assert start < 20_000 or len(heard) < 0.15 * len(part)
 
 
 @pytest.mark.parametrize("jitter_us", [3, 10])
@@ -221,14 +202,18 @@ def test_a_code_is_hardly_taken_for_a_lamp(jitter_us):
     chip, cluster = np.nonzero(np.diff(chips.astype(int), axis=0, prepend=0) == 1)
     t = (1000 + chip * packet.chip_us + rng.normal(0, jitter_us, len(chip))).astype(np.int64)
     rises = in_order(t, cluster, np.full(len(t), 3), np.ones(len(t)))
-    rhythm = Rhythm(1280, 720, packet.chip_us, SPEC.min_score)
-    kept = np.zeros(codebook.clusters, int)
-    for start, part in steps(rises, int(t.max())):
-        rhythm.step(start, part, np.zeros((180, 320), np.int16), 2)
-        kept += np.bincount(rhythm.of(part).x, minlength=len(kept))
-    lost = 1 - kept / np.bincount(cluster)
+    heard = np.concatenate([some.x for _, some, _ in in_rhythm(rises, int(t.max()))])
+    lost = 1 - np.bincount(heard, minlength=codebook.clusters) / np.bincount(cluster)
     assert lost.mean() < 0.02
     assert lost.max() < 0.15
+
+
+def in_rhythm(events, until_us):
+    """Of each step its start, us, the events of pixels in the rhythm of the chips, and all."""
+    rhythm = Rhythm(1280, 720, LINK.packet.chip_us, SPEC.min_score)
+    for start, part in steps(events, until_us):
+        rhythm.step(start, part, np.zeros((180, 320), np.int16), 2)
+        yield start, rhythm.of(part), part
 
 
 def test_a_region_takes_its_bars_size_and_gathers_its_events():

@@ -36,12 +36,10 @@ def seen(error_px, rng):
     return -slope, straighten(PLACES, off - slope * PLACES - mean + 0.01 * (PLACES**2 - 56 / 3), 0.1, 0.01)
 
 
-def judged(error_px, rng):
-    """Error of the scale, that of the straight bar's spacing, px, and the square of that by its variance."""
-    short, found = seen(error_px, rng)
-    if found is None:
-        return None
-    return short, short - found.slope, (short - found.slope) ** 2 / found.variance
+def judged(errors_of, rng):
+    """Errors of scales, those of the straight bars' spacing, px, and squares of those by their variance."""
+    found = [(px, one) for px, one in (seen(errors_of(rng), rng) for _ in range(400)) if one is not None]
+    return np.array([(px, px - one.slope, (px - one.slope) ** 2 / one.variance) for px, one in found]).T
 
 
 def test_noise_and_a_lean_bend_nothing():
@@ -58,9 +56,8 @@ def test_noise_and_a_lean_bend_nothing():
 def test_dark_leds_are_told_from_a_straight_bar():
     """Most boundaries agree: the error is a third of that of a scale through all, and its sigma is true."""
     rng = np.random.default_rng(2)
-    found = np.array([one for _ in range(400) if (one := judged(dark(rng), rng)) is not None])
-    assert len(found) > 300
-    before, after, squares = found.T
+    before, after, squares = judged(dark, rng)
+    assert len(before) > 300
     assert np.median(np.abs(after)) < 0.35 * np.median(np.abs(before))
     assert np.sqrt(np.mean(after**2)) < 0.65 * np.sqrt(np.mean(before**2))
     assert 0.2 < squares.mean() < 1.2
@@ -74,11 +71,10 @@ def test_dark_leds_are_told_from_a_straight_bar():
 def test_what_drops_add_to_a_scale_is_in_the_sigma():
     """Most of it is seen by how neighbours err, but a drop over half of a bar hardly bends it."""
     rng = np.random.default_rng(3)
-    found = np.array([one for _ in range(400) if (one := judged(drops(rng), rng)) is not None])
-    assert len(found) > 350
-    before, after = np.abs(found[:, :2].T)
+    before, after, squares = np.abs(judged(drops, rng))
+    assert len(before) > 350
     assert np.sqrt(np.mean(after**2)) < 0.8 * np.sqrt(np.mean(before**2))
     assert np.median(after) < 0.7 * np.median(before)
     # A few hundred times as much where 1 in 200 looks like dark LEDs.
-    assert 0.3 < np.minimum(found[:, 2], 9).mean() < 1.5
-    assert np.mean(found[:, 2] > 3) < 0.1
+    assert 0.3 < np.minimum(squares, 9).mean() < 1.5
+    assert np.mean(squares > 3) < 0.1

@@ -21,9 +21,8 @@ def line(speed, *, along=0.0, slope=0.0, upright=True, rhythmic=True, noise=0.1,
     x, y = (600 + across, 300 + length) if upright else (600 + length, 300 + across)
     stray = rng.random(many) < noise
     x, y = np.where(stray, rng.uniform(500, 700, many), x), np.where(stray, rng.uniform(200, 400, many), y)
-    order = np.argsort(t, kind="stable")
     columns = 30_000 + t, np.rint(x), np.rint(y), rng.integers(0, 2, many)
-    return Events.of(*(one[order].astype(int) for one in columns))
+    return Events.of(*columns)[np.argsort(t, kind="stable")]
 
 
 BOX = 480, 180, 720, 420
