@@ -9,7 +9,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,7 +25,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io.open import open_source
 from evlcp_sdk.live import Publisher, server
 from evlcp_sdk.live.recorder import Recorder
-from evlcp_sdk.live.server import Server
 from evlcp_sdk.live.services import Serving, serve
 from evlcp_sdk.live.viewer import Viewer, page
 from evlcp_sdk.place.navigator import Place, Placed
@@ -50,27 +49,17 @@ class Stage:
     """A run that a test makes up, and its view."""
 
     publisher: Publisher
-    services: dict[str, Server]
-
-    @property
-    def view(self) -> Viewer:
-        view = self.services["view"]
-        assert isinstance(view, Viewer)
-        return view
+    view: Viewer
 
     def connect(self, **given: Any) -> ClientConnection:
         return connect(self.view.url.replace("http", "ws") + "live", compression=None, max_size=None, **given)
 
     def ask(self, path: str, **headers: str) -> tuple[int, dict[str, str], str]:
         link = http.client.HTTPConnection("127.0.0.1", self.view.port, timeout=10)
-        link.putrequest("GET", path, skip_host="Host" in headers)
-        for name, value in headers.items():
-            link.putheader(name, value)
-        link.endheaders()
-        answer = link.getresponse()
-        found = answer.status, dict(answer.getheaders()), answer.read().decode()
-        link.close()
-        return found
+        with closing(link):
+            link.request("GET", path, headers=headers)
+            answer = link.getresponse()
+            return answer.status, dict(answer.getheaders()), answer.read().decode()
 
     def frame(self, n: int) -> None:
         frame = FRAMES[n % len(FRAMES)]
@@ -86,7 +75,7 @@ class Stage:
 def staged(**given: Any) -> Iterator[Stage]:
     publisher = Publisher()
     with serve(Serving(view=True, **given), publisher, LINKS, name="a name", sites=(SITE,)) as services:
-        yield Stage(publisher, services)
+        yield Stage(publisher, services["view"])  # type: ignore[arg-type]
         publisher.close()
 
 
