@@ -12,16 +12,14 @@ from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.report.figures import Figures, draw_distance, draw_presence, draw_regions
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
+from evlcp_sdk.testing import ideal_presence
+from evlcp_sdk.testing.trees import map_arrays
 from evlcp_sdk.values import Events, Frame, Packet, PresenceMap, Range, Region, SoftSymbols
 
 
 def presence(fill: float) -> PresenceMap:
-    probability = np.zeros((16, 40, 4), np.float32)
-    pixels = np.zeros((16, 80, 8), np.float32)
-    for k in range(16):
-        probability[k, 2 * k : 2 * k + 2, 1:3] = fill
-        pixels[k, 4 * k : 4 * k + 4, 2:6] = fill
-    return PresenceMap(probability, 2, probability > 0.5, pixels)
+    shown = ideal_presence(16)
+    return map_arrays(shown, lambda array: (array * fill).astype(array.dtype))
 
 
 def frame(transmitter: int, number: int, distance_m: float, quality: float = 0.9) -> Frame:

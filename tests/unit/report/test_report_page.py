@@ -22,7 +22,8 @@ from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.run import receive_to_folder
-from evlcp_sdk.values import Events, Frame, FrameView, Packet, PresenceMap, Range, SoftSymbols
+from evlcp_sdk.testing import ideal_view
+from evlcp_sdk.values import Events, Frame, FrameView, Packet, Range, SoftSymbols
 from tests.conftest import rows_of
 from tests.unit.report.test_pages import HOSTILE, Elements
 from tests.unit.results.test_positions import ATTITUDE, SITE, packets
@@ -119,36 +120,24 @@ def test_the_slow_motion_is_what_was_sent(result: Path) -> None:
         assert np.corrcoef(seen, change[:, k])[0, 1] > 0.8
 
 
-def view_of(height: int, width: int, clusters: int = 16) -> FrameView:
-    grid = 2
-    probability = np.zeros((clusters, height // grid, width // grid), np.float32)
-    for k, inside in enumerate(np.array_split(np.arange(4, height // grid - 4), clusters)):
-        probability[k, inside, 4:-4] = 0.9
-    presence = PresenceMap(
-        probability, grid, probability > 0.5, np.zeros((clusters, height, width), np.float32)
-    )
-    soft = SoftSymbols(np.zeros(clusters, np.int64), np.zeros((clusters, 6), np.float32), 0.9)
-    sums = np.random.default_rng(1).integers(-1, 2, (32, height, width)).astype(np.int16)
-    return FrameView(sums, np.zeros((2, 32)), presence, soft)
-
-
-def frame_of(view: FrameView, number: int, transmitter: int = 0) -> Frame:
+def motion_of(cluster_px: int) -> tuple[Motion, FrameView]:
+    view = ideal_view(LINK.codebook, np.zeros(16, np.int64), cluster_px=cluster_px)
     nothing = Range(math.nan, math.nan, 0)
-    return Frame(transmitter, 0, number, 3200.0 * number, view.soft, nothing, None, 5.0, 6.0)
+    return Motion.of(Frame(0, 0, 0, 0.0, view.soft, nothing, None, 5.0, 6.0), view), view
 
 
 def test_a_picture_is_bounded_whatever_its_size() -> None:
-    view = view_of(700, 400)
-    motion = Motion.of(frame_of(view, 0), view)
+    motion, view = motion_of(100)
+    assert view.sums.size > 1_000_000
     assert motion.sums[0].shape == motion.clusters.shape
     assert motion.sums.size <= 300_000
     assert list(np.unique(motion.clusters)) == list(range(-1, 16))
-    small = view_of(40, 24)
-    cut = Motion.of(frame_of(small, 0), small)
-    rows, columns = np.nonzero(cluster_map(small.presence, (40, 24)) >= 0)
+    cut, view = motion_of(8)
+    rows, columns = np.nonzero(cluster_map(view.presence, view.sums.shape[1:]) >= 0)
     top, left = rows.min() - 3, columns.min() - 3
     height, width = cut.clusters.shape
-    assert (cut.sums == small.sums[:, top : top + height, left : left + width]).all()
+    assert (height, width) == (np.ptp(rows) + 7, np.ptp(columns) + 7)
+    assert (cut.sums == view.sums[:, top : top + height, left : left + width]).all()
 
 
 def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) -> None:
