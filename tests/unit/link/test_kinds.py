@@ -2,17 +2,16 @@
 
 import json
 import pickle
-from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from evlcp_sdk.air.blocks import BlockError, Kind, Message
-from evlcp_sdk.air.kinds import BUILT_IN_KINDS, Countdown, CountdownKind, MessageKind, TimeKind
+from evlcp_sdk.air.kinds import BUILT_IN_KINDS, Countdown, CountdownKind, TimeKind
 from evlcp_sdk.errors import ConfigError, PluginWarning
 from evlcp_sdk.link.compose import compose, packets_of
 from evlcp_sdk.link.resolve import load_link
@@ -89,24 +88,14 @@ def test_a_time_and_a_countdown() -> None:
         CountdownKind().unpack(bytes([1, 6, 0, 0, 0, 0]))
 
 
-def bring(number: Any, name: Any, shown: Mapping[str, Any] | None = None) -> tuple[object, MessageKind]:
-    class Other(wind.Wind):
-        def to_dict(self, value: Any) -> Mapping[str, Any]:
-            return shown or {}
-
-    Other.number, Other.name = number, name
-    kind = Other()
-
-    class Plugin:
-        @hookimpl
-        def evlcp_message_kinds(self) -> Iterator[MessageKind]:
-            yield kind
-
-    return Plugin(), kind
+def bring(number: int, name: str) -> object:
+    """A plugin with a kind of messages."""
+    kind = type("Other", (wind.Wind,), {"number": number, "name": name})()
+    return SimpleNamespace(evlcp_message_kinds=hookimpl(lambda: iter((kind,))))
 
 
 def test_of_two_kinds_of_one_number_one_stays() -> None:
-    registry = Registry.load(bring(9, "here")[0], bring(9, "there")[0])
+    registry = Registry.load(bring(9, "here"), bring(9, "there"))
     with pytest.warns(PluginWarning, match="number 9 or its name is that of"):
         kinds = message_kinds(registry)
     assert len(kinds) == 7

@@ -1,8 +1,9 @@
 """Sinks: a format is one file and one hook; what fails is named, and leaves nothing."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -81,13 +82,8 @@ Watching = type("Watching", (Sink,), {"evlcp_stage_finished": fails_at_a_stage})
 
 def bring(name: str, target: str, **more: Any) -> Registry:
     """A plugin with one format."""
-
-    class Plugin:
-        @hookimpl
-        def evlcp_sinks(self) -> Iterator[SinkRecord]:
-            yield SinkRecord(name, target, ("failing.txt",), "a test", **more)
-
-    return Registry.load(Plugin())
+    sink = SinkRecord(name, target, ("failing.txt",), "a test", **more)
+    return Registry.load(SimpleNamespace(evlcp_sinks=hookimpl(lambda: iter((sink,)))))
 
 
 @pytest.mark.parametrize(
