@@ -66,21 +66,18 @@ def test_two_algorithms_with_one_name_are_told_when_asked_for(monkeypatch: pytes
     assert caught.value.exit_code == 2
 
 
-class Typo(Brings):
-    @hookimpl
-    def evlcp_algoritms(self) -> None: ...
+def plugin(**hooks: Callable[..., Any]) -> object:
+    """One with these hooks."""
+    return SimpleNamespace(**{name: hookimpl(hook) for name, hook in hooks.items()})
 
 
-class OtherArguments(Brings):
-    @hookimpl
-    def evlcp_stage_finished(self, stage: str, nothing: str) -> None: ...
+def failing() -> Iterator[Algorithm]:
+    yield ranging("early")
+    raise ZeroDivisionError("by design")
 
 
-class Failing:
-    @hookimpl
-    def evlcp_algorithms(self) -> Iterator[Algorithm]:
-        yield ranging("early")
-        raise ZeroDivisionError("by design")
+def brings_mine() -> Iterator[Algorithm]:
+    yield ranging("mine")
 
 
 def missing() -> object:
@@ -99,10 +96,19 @@ BROKEN: dict[str, tuple[Callable[[], object], str]] = {
         "algorithm 'x' has role 'rangin', expected one of detection, framing, pilots, ",
     ),
     "record": (lambda: Brings(ranging("mine"), "poc"), "evlcp_algorithms() gave something else than Alg"),
-    "nothing": (lambda: SimpleNamespace(evlcp_algorithms=hookimpl(lambda: None)), "evlcp_algorithms() gave"),
-    "fails": (Failing, "evlcp_algorithms() fails: ZeroDivisionError: by design"),
-    "typo": (lambda: Typo(ranging("mine")), "has the hook 'evlcp_algoritms', which this SDK does not have"),
-    "arguments": (lambda: OtherArguments(ranging("mine")), "nothing"),
+    "nothing": (lambda: plugin(evlcp_algorithms=lambda: None), "evlcp_algorithms() gave"),
+    "fails": (
+        lambda: plugin(evlcp_algorithms=failing),
+        "evlcp_algorithms() fails: ZeroDivisionError: by design",
+    ),
+    "typo": (
+        lambda: plugin(evlcp_algorithms=brings_mine, evlcp_algoritms=lambda: None),
+        "has the hook 'evlcp_algoritms', which this SDK does not have",
+    ),
+    "arguments": (
+        lambda: plugin(evlcp_algorithms=brings_mine, evlcp_stage_finished=lambda stage, nothing: None),
+        "nothing",
+    ),
 }
 
 
@@ -127,21 +133,12 @@ def test_a_broken_plugin_is_left_out_and_told(fault: str, monkeypatch: pytest.Mo
 
 
 def test_a_plugin_that_fails_when_asked_is_left_out_from_then_on() -> None:
-    class Bad:
-        @hookimpl
-        def evlcp_open_events(self, url: str) -> None:
-            raise KeyError(url)
+    def fail(url: str) -> None:
+        raise KeyError(url)
 
-        @hookimpl
-        def evlcp_stage_finished(self, stage: str) -> None: ...
-
-    class Good:
-        @hookimpl
-        def evlcp_open_events(self, url: str) -> str:
-            return f"source of {url}"
-
-    registry = Registry(Bad(), Good())
-    with pytest.warns(PluginWarning, match=r"plugin Bad-\w+ is .*: evlcp_open_events\(\) fails: KeyError"):
+    bad = plugin(evlcp_open_events=fail, evlcp_stage_finished=lambda stage: None)
+    registry = Registry(bad, plugin(evlcp_open_events=lambda url: f"source of {url}"))
+    with pytest.warns(PluginWarning, match=r"plugin \S+ is .*: evlcp_open_events\(\) fails: KeyError"):
         answers = registry.ask("evlcp_open_events", url="cam:0")
     assert [answer for _, answer in answers] == ["source of cam:0"]
     assert registry.plugins("evlcp_stage_finished") == []
@@ -151,12 +148,11 @@ def test_a_plugin_that_fails_when_asked_is_left_out_from_then_on() -> None:
 def adding(command: Callable[..., None], fails: bool = False) -> Callable[[], object]:
     """A plugin that adds a command, and may fail behind that."""
 
-    @hookimpl
     def add(app: Any) -> None:
         app.command()(command)
         assert not fails, "by design"
 
-    return lambda: SimpleNamespace(evlcp_register_commands=add)
+    return lambda: plugin(evlcp_register_commands=add)
 
 
 def mine() -> None:
