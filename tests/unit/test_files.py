@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -49,7 +50,7 @@ def write_text(text: str, path: Path) -> None:
         outputs.commit()
 
 
-def test_an_earlier_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None:
+def test_an_earlier_file_stays_until_the_new_one_is_whole(tmp_path, monkeypatch) -> None:
     path = tmp_path / "a.txt"
     write_text("old", path)
     with suppress(KeyError), Outputs() as outputs:
@@ -60,6 +61,10 @@ def test_an_earlier_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> Non
         outputs.path(path).write_text("new")
         assert path.read_text() == "old"
         outputs.commit()
+    # A death just before it comes into place leaves the earlier one, too.
+    monkeypatch.setattr(Path, "replace", Mock(side_effect=KeyboardInterrupt))
+    with suppress(KeyboardInterrupt):
+        write_text("newer", path)
     assert path.read_text() == "new"
     assert list(tmp_path.iterdir()) == [path]
 

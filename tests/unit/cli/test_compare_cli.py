@@ -26,7 +26,7 @@ VARIANTS = {
     "filtered": ("ranging.id=joint-scale", "tracking.id=kalman"),
 }
 OPTIONS = [part for name, s in VARIANTS.items() for part in ("--variant", f"{name}:{','.join(s)}")]
-TIMES = ("us_per_frame", "separation_us", "decoding_us", "ranging_us", "cpu_s", "times_real_time", "best")
+TIMES = {"us_per_frame", "separation_us", "decoding_us", "ranging_us", "cpu_s", "times_real_time", "best"}
 
 
 @pytest.fixture
@@ -47,13 +47,8 @@ def test_the_numbers_are_those_of_receive_and_score(evlcp: Evlcp, recording: Pat
         assert evlcp("receive", recording, "-o", tmp_path / name, *options).code == 0
         told = json.loads(evlcp("score", tmp_path / name, tmp_path / "REC.truth.json", "--json").out)
         (bar,), (road,), row = told["bars"], told["road"]["bars"], rows[name]
-        for mine, theirs in (
-            (row["frames"], told["rows"]),
-            (row["unmatched"], told["unmatched"]),
-            (round(row["ber"], 6), bar["ber"]),
-            (round(row["gross_share"], 4), bar["over_half_metre"]),
-        ):
-            assert mine == theirs
+        assert (row["frames"], row["unmatched"]) == (told["rows"], told["unmatched"])
+        assert (round(row["ber"], 6), round(row["gross_share"], 4)) == (bar["ber"], bar["over_half_metre"])
         assert row["nees"] == pytest.approx(road["nees"], rel=0.02)
         frames = read_frames(tmp_path / name)
         assert row["packets"] == len((tmp_path / name / "packets.jsonl").read_text().splitlines())
@@ -96,9 +91,8 @@ def test_text_and_files(evlcp: Evlcp, recording: Path, tmp_path: Path) -> None:
     # In this process or another: the same, but for the time.
     here = json.loads(evlcp("compare", recording, *OPTIONS, "--json").out)["rows"]
     for one, other in zip(here, table["rows"], strict=False):
-        assert {k: v for k, v in one.items() if k not in TIMES} == {
-            k: v for k, v in other.items() if k not in TIMES
-        }
+        assert one.keys() == other.keys()
+        assert {key for key, value in one.items() if value != other[key]} <= TIMES
 
 
 @pytest.mark.parametrize(
@@ -125,15 +119,14 @@ def test_faults(evlcp, recording, monkeypatch, arguments, code, told) -> None:
 
 
 def test_of_several_recordings_the_others_are_compared(evlcp: Evlcp, recording: Path, tmp_path: Path) -> None:
-    (tmp_path / "torn.truth.json").write_text("{")
-    shutil.copy(recording, tmp_path / "torn.raw")
-    done = evlcp(
-        "compare", tmp_path / "none.raw", tmp_path / "torn.raw", recording, "--variant", "a:", "--json"
-    )
+    none, torn = tmp_path / "none.raw", tmp_path / "torn.raw"
+    torn.with_suffix(".truth.json").write_text("{")
+    shutil.copy(recording, torn)
+    done = evlcp("compare", none, torn, recording, "--variant", "a:", "--json")
     assert done.code == 3
-    missing, torn = done.err.splitlines()
-    assert missing == f"evlcp: {tmp_path}/none.raw: No such file or directory"
-    assert torn.startswith(f"evlcp: {tmp_path}/torn.truth.json: not JSON")
+    first, second = done.err.splitlines()
+    assert first == f"evlcp: {none}: No such file or directory"
+    assert second.startswith(f"evlcp: {tmp_path}/torn.truth.json: not JSON")
     assert [row["recording"] for row in json.loads(done.out)["rows"]] == [str(recording)]
 
 
