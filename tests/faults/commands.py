@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -100,11 +100,17 @@ def held(folder: Path) -> dict[str, bytes]:
     return found
 
 
-def faults_of(calls: Sequence[str]) -> Iterator[tuple[str, int, str]]:
-    """How, where and what fails: each call in one of the ways, in turn, or in all of them."""
-    for at, call in enumerate(calls):
-        for how in HOW if ALL else (HOW[at % len(HOW)],):
-            yield how, at, call
+def faults_of(calls: Sequence[str], every: int = 1) -> Iterator[tuple[str, int, str]]:
+    """How and where a call fails, in words: one in `every`, one way each in turn, or all in all ways."""
+    faults = [(how, at) for at in range(len(calls)) for how in (HOW if ALL else (HOW[at % len(HOW)],))]
+    for how, at in faults[:: 1 if ALL else every]:
+        yield how, at, f"{how} at {at} ({calls[at]})"
+
+
+def is_told(ended: Ended) -> bool:
+    """A command that could not write says so in one line, unless it was killed."""
+    line = ended.err.count("\n") == 1 and ": cannot be written: " in ended.err
+    return ended.code in (None, 0) or (ended.code == 1 and line)
 
 
 @dataclass
@@ -118,7 +124,6 @@ class Trial:
         check: Raises where the folder is not what a reader takes.
         stale: Files of still earlier runs.
         every: Of so many faults one is tried.
-        calls: What the new one calls.
     """
 
     old: tuple[str, ...]
@@ -127,65 +132,48 @@ class Trial:
     check: Callable[[Path], None] = lambda _: None
     stale: tuple[str, ...] = ()
     every: int = 1
-    calls: tuple[str, ...] = field(default=())
 
-    def faults(self, work: Path) -> Iterator[str]:
-        """What is wrong after each fault; nothing where each result is complete and true, or flagged."""
-        before, after, out = work / "before", work / "after", work / "out"
-        for folder in (before, after):
-            folder.mkdir()
-        # Names in results say where they were written.
-        warm(*self._put(self.old, before))
-        states = []
-        for arguments in (self.old, self.new):
-            shutil.rmtree(out, ignore_errors=True)
-            if states:
-                shutil.copytree(before, out)
-            else:
-                out.mkdir()
-            ended = run(self._put(arguments, out), out)
-            assert ended.code == 0, ended
-            if not states:
-                for name in self.stale:
-                    (out / name).write_text("of an earlier run")
-                shutil.rmtree(before)
-                shutil.copytree(out, before)
-            states.append(held(out))
-        self.calls = ended.calls
-        old, new = states
-        for how, at, call in list(faults_of(self.calls))[:: 1 if ALL else self.every]:
+    def faults(self, work: Path) -> tuple[list[str], tuple[str, ...]]:
+        """What is wrong after each fault: a result that is not whole and true, nor flagged; and all calls."""
+        before, out = work / "before", work / "out"
+        before.mkdir()
+        old, new = (tuple(a.replace("OUT", str(out)) for a in one) for one in (self.old, self.new))
+        warm(*(a.replace("OUT", str(before)) for a in self.old))
+        shutil.rmtree(before)
+        out.mkdir()
+        assert run(old, out).code == 0
+        for name in self.stale:
+            (out / name).write_text("of an earlier run")
+        shutil.copytree(out, before)
+        ended = run(new, out)
+        assert ended.code == 0, ended
+        whole, wrong = (held(before), held(out)), []
+        for how, at, words in faults_of(ended.calls, self.every):
             shutil.rmtree(out)
             shutil.copytree(before, out)
-            ended = run(self._put(self.new, out), out, at, how)
-            for text in self._wrong(ended, out, old, new, call, how):
-                yield f"{how} at {at} ({call}), {ended}: {text}"
+            met = run(new, out, at, how)
+            wrong += [f"{words}, {met}: {text}" for text in self._wrong(met, out, *whole)]
+        return wrong, ended.calls
 
-    def _put(self, arguments: tuple[str, ...], out: Path) -> tuple[str, ...]:
-        return tuple(a.replace("OUT", str(out)) for a in arguments)
-
-    def _wrong(
-        self, ended: Ended, out: Path, old: dict[str, bytes], new: dict[str, bytes], call: str, how: str
-    ) -> Iterator[str]:
+    def _wrong(self, ended: Ended, out: Path, old: dict[str, bytes], new: dict[str, bytes]) -> Iterator[str]:
         found = held(out)
         if ended.code == 0 and found != new:
             yield "says that it is done, and is not"
-        if ended.code not in (None, 0):
-            if ended.code != 1 or ended.err.count("\n") != 1 or ": cannot be written: " not in ended.err:
-                yield "expected one line and exit code 1"
-            if any(p.name.startswith(STAGE_PREFIX) for p in out.iterdir()):
-                yield "leaves hidden files"
+        if not is_told(ended):
+            yield "expected one line and exit code 1"
+        if ended.code and any(p.name.startswith(STAGE_PREFIX) for p in out.iterdir()):
+            yield "leaves hidden files"
         if found in (old, new):
             try:
                 self.check(out)
             except InputError as fault:
                 yield f"a whole result is refused: {fault}"
         elif self.seal in found:
-            if self.seal.endswith(".json"):
-                try:
-                    read_json(out / self.seal)
-                except InputError as fault:
-                    if "unfinished" in str(fault):
-                        return
+            try:
+                read_json(out / self.seal)
+            except InputError as fault:
+                if "unfinished" in str(fault):
+                    return
             yield f"torn: {sorted(found)}"
 
 
@@ -269,55 +257,49 @@ def sweep(work: Path) -> tuple[list[str], tuple[str, ...]]:
     out = work / "out"
     arguments = ("sweep", "campaign.toml", "-o", str(out / "r.sqlite"), "--workers", "0")
 
-    def results() -> Any:
-        with Store(out / "r.sqlite") as store:
+    def fresh(at: int = -1, how: str = "fails") -> Ended:
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        return run(arguments, out, at, how)
+
+    def collected(path: Path) -> Any:
+        with Store(path, create=True) as store:
+            collect(plan, store, Inline(), run_fake)
             return store.results()
 
-    out.mkdir()
-    with Store(work / "whole.sqlite", create=True) as store:
-        collect(plan, store, Inline(), run_fake)
-        whole = store.results()
-    warm(*arguments)
-    shutil.rmtree(out)
-    out.mkdir()
-    calls = run(arguments, out).calls
-    assert results() == whole
-    faults = []
-    for how, at, call in faults_of(calls):
-        shutil.rmtree(out)
-        out.mkdir()
-        ended = run(arguments, out, at, how)
-        where = f"{how} at {at} ({call}), {ended}: "
-        if ended.code not in (None, 0) and (
-            ended.code != 1 or ended.err.count("\n") != 1 or ": cannot be written: " not in ended.err
-        ):
-            faults.append(where + "expected one line and exit code 1")
+    def kept() -> Any:
         try:
-            kept = results()
+            with Store(out / "r.sqlite") as store:
+                return store.results()
         except InputError:
-            kept = {}  # nothing was kept yet, which is said
-        if not kept.items() <= whole.items() or (ended.code == 0 and kept != whole):
-            faults.append(where + "what is kept is not true")
+            return {}  # nothing was kept yet, which is said
+
+    whole = collected(work / "whole.sqlite")
+    out.mkdir()
+    warm(*arguments)
+    calls = fresh().calls
+    assert kept() == whole
+    faults = []
+    for how, at, words in faults_of(calls):
+        ended = fresh(at, how)
+        if not is_told(ended):
+            faults.append(f"{words}, {ended}: expected one line and exit code 1")
+        if not kept().items() <= whole.items() or (ended.code == 0 and kept() != whole):
+            faults.append(f"{words}, {ended}: what is kept is not true")
         try:
-            with Store(out / "r.sqlite", create=True) as store:
-                collect(plan, store, Inline(), run_fake)
+            again = collected(out / "r.sqlite")
         except EvlcpError as fault:
-            faults.append(where + f"the same command does not go on: {fault}")
-        else:
-            if results() != whole:
-                faults.append(where + "the same command does not give the same")
+            again = fault
+        if again != whole:
+            faults.append(f"{words}, {ended}: the same command gives {again}")
     return faults, calls
 
 
 def tell(name: str, work: Path, demo: Path) -> None:
     # Looked up once for all forks.
     typer.main.get_params_from_function = cache(typer.main.get_params_from_function)
-    if name == "sweep":
-        faults, calls = sweep(work)
-    else:
-        trial = {"receive": receive, "sinks": sinks, "simulate": simulate, "tx": tx}[name](work, demo)
-        faults = list(trial.faults(work))
-        calls = trial.calls
+    trials = {"receive": receive, "sinks": sinks, "simulate": simulate, "tx": tx}
+    faults, calls = sweep(work) if name == "sweep" else trials[name](work, demo).faults(work)
     print(json.dumps({"faults": faults, "calls": calls}))
 
 
