@@ -114,31 +114,21 @@ def test_another_encoding_than_declared(written, declared, n, tmp_path):
     assert caught.value.offset >= len(header)
 
 
-LOSSES = {
-    "words before the first TIME_HIGH": ([0x0003, 0x2804, 0x6001, *GOOD], b"", "words_before_time", 3, 0),
-    "odd trailing byte": (GOOD, b"\x01", "odd_bytes", 1, 8),
-    "cut after the base of a vector": ([*GOOD, 0x3010], b"", "vectors_cut", 1, 8),
-    "x outside": ([*GOOD, 0x2000 | 640, 0x2000 | 700], b"", "outside_sensor", 2, 8),
-    "y outside": ([*GOOD, 480, 0x2001], b"", "outside_sensor", 1, 10),
-    "a vector over the edge": ([*GOOD, 0x327F, 0x4003, 0x4000, 0x5000], b"", "outside_sensor", 1, 10),
-    "time running backward": ([*GOOD, 0x6001, 0x2005], b"", "time_backward", 1, 10),
-    "a glitch of TIME_HIGH": ([*GOOD, 0x8000, 0x8001, 0x6002], b"", "time_glitches", 1, 8),
-    "reserved words": ([*GOOD, 0x1000, 0x9000, 0xB000, 0xC000, 0xD000], b"", "reserved_words", 5, 8),
-    "an event before any row": ([0x8001, 0x2004, *GOOD[1:]], b"", "row_unknown", 1, 2),
-    "a vector before any base": ([*GOOD, 0x4003, 0x5001], b"", "column_unknown", 3, 8),
-    "EVT2: odd trailing bytes": ([0x80000001, 0x1], b"\x01\x02\x03", "odd_bytes", 3, 8),
-    "EVT2: y outside": ([0x80000001, 0x1, 480], b"", "outside_sensor", 1, 8),
-}
-
-
-@pytest.mark.parametrize("name", LOSSES)
-def test_loss_is_counted_with_its_first_offset(name, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "words", "tail", "kind", "count", "first"),
+    [
+        ("EVT3", [0x0003, 0x2804, 0x6001, *GOOD], b"", "words_before_time", 3, 0),
+        ("EVT3", GOOD, b"\x01", "odd_bytes", 1, 8),
+        ("EVT3", [*GOOD, 0x2000 | 640, 0x2000 | 700], b"", "outside_sensor", 2, 8),
+        ("EVT2", [0x80000001, 0x1], b"\x01\x02\x03", "odd_bytes", 3, 8),
+    ],
+)
+def test_loss_is_counted_with_its_first_offset(name, words, tail, kind, count, first, tmp_path):
     """As a file says it; any words against a twin: `test_evt.py`."""
-    words, tail, kind, count, first = LOSSES[name]
-    header, size = (format_header(CODECS["EVT2"], 640, 480), "<u4") if "EVT2" in name else (HEADER, "<u2")
-    with open_source(raw(tmp_path / "a.raw", words, header, tail, size)) as source:
+    header = format_header(CODECS[name], 640, 480)
+    with open_source(raw(tmp_path / "a.raw", words, header, tail, CODECS[name].word)) as source:
         got, _ = source.read()
-    assert len(got) == 1 + (name == "a vector over the edge")
+    assert len(got) == 1
     assert source.losses.keys() == {kind}
     loss = source.losses[kind]
     assert (loss.count, loss.first, loss.unit) == (count, len(header) + first, "byte")
