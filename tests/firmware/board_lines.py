@@ -81,6 +81,21 @@ def shown(device: SimulatedBoard) -> NDArray[np.uint8]:
     return device.records().played().chips(None)
 
 
+def packets_shown(chips: NDArray[np.uint8], link: Link = LINK) -> tuple[list[NDArray[np.uint8]], int]:
+    """The packets that were shown, and how many chips of the idle pattern stood between them."""
+    preamble, length = link.codebook.preamble[:, None], link.packet.packet_chips
+    found, at, idle = [], 0, 0
+    while at + length <= len(chips):
+        if (chips[at : at + len(preamble)] == preamble).all():
+            found.append(chips[at : at + length])
+            at += length
+        else:
+            assert (chips[at] == idle % 2).all(), f"chip {at} is neither of a packet nor of the idle pattern"
+            at += 1
+            idle += 1
+    return found, idle
+
+
 def well(done: Run) -> Run:
     """A command that has ended well."""
     assert done.code == 0, done.err

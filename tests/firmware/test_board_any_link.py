@@ -325,7 +325,7 @@ def test_the_commands(evlcp, tmp_path: Path, device: SimulatedBoard, board: Boar
         check_fault(evlcp("board", "leds", record, "--chips", out, *OPTIONS[4:], *other), 3, says)
 
 
-# -- characters and 4-PPM, by the test's own encoders
+# -- characters, by the test's own encoder, and 4-PPM
 
 LAMP = ["bar.rows=6", "bar.columns=1", "bar.cluster_rows=6", "bar.cluster_columns=1", "framing.id=uart"]
 SERIAL = [*LAMP, "framing.data_bits=7", "framing.parity=even", "framing.stop_bits=2"]
@@ -345,33 +345,18 @@ def serial_chips(text: bytes, bits: int, odd: int, stops: int, turned: bool = Fa
     return [chip ^ turned for chip in chips]
 
 
-def pulse_chips(symbols: NDArray[np.int64], link: Link) -> NDArray[np.uint8]:
-    """4-PPM: in each four chips one is lit, and its place says two bits."""
-    clusters = symbols.shape[1]
-    rows = [[chip] * clusters for chip in link.codebook.preamble.tolist()]
-    for frame in symbols:
-        rows += link.codebook.pilots.T.tolist()
-        for first in (4, 2, 0):
-            places = frame >> first & 3
-            rows += [[int(place == slot) for place in places] for slot in range(4)]
-    return np.array(rows, np.uint8)
-
-
 def packet_of(kind: str) -> tuple[Link, NDArray[np.int64], NDArray[np.uint8]]:
     """A link, a packet's symbols, and the chips of its LEDs, (chips, LEDs)."""
     if kind == "4-PPM":
         link = board_link(*PULSES, "air.frames_per_packet=3")
         symbols = symbols_of(1, 2, link)[0]
-        return link, symbols, np.repeat(pulse_chips(symbols, link), 6, axis=1)
+        return link, symbols, np.repeat(packet_chips(symbols, link.codebook, 1), 6, axis=1)
     text = b"Tempo 30!"
     ports = {"7E2": (SERIAL, (7, 0, 2)), "8O1, turned": (TURNED, (8, 1, 1, True))}
     overrides, port = ports[kind]
     link = board_link(*overrides, f"air.frames_per_packet={len(text)}")
-    return (
-        link,
-        np.array(list(text))[:, None],
-        np.array([[chip] * 6 for chip in serial_chips(text, *port)], np.uint8),
-    )
+    chips = np.array(serial_chips(text, *port), np.uint8)
+    return link, np.array(list(text))[:, None], np.repeat(chips[:, None], 6, axis=1)
 
 
 KINDS = ["7E2", "8O1, turned", "4-PPM"]

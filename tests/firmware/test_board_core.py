@@ -78,20 +78,9 @@ def test_core_calls_only_the_hal(tmp_path: Path) -> None:
         included = re.findall(r'#include [<"](.+?)[>"]', source.read_text())
         assert not {"stdio.h", "stdlib.h", "string.h"} & set(included)
     made = str(tmp_path / "core.o")
-    flags = [
-        "-std=c11",
-        "-ffreestanding",
-        "-O2",
-        "-Wall",
-        "-Wextra",
-        "-Werror",
-        "-nostdlib",
-        "-r",
-        "-o",
-        made,
-    ]
+    flags = ["-std=c11", "-ffreestanding", "-O2", "-Wall", "-Wextra", "-Werror", "-nostdlib", "-r", "-o"]
     include = [f"-I{build.FIRMWARE / folder}" for folder in ("core", "generated")]
-    done = run(os.environ.get("CC", "cc"), *flags, *include, *map(str, core))
+    done = run(os.environ.get("CC", "cc"), *flags, made, *include, *map(str, core))
     assert done.returncode == 0, done.stderr
     outside = {line.split()[-1] for line in run("nm", "-u", made).stdout.splitlines()}
     # struct copies may become calls of these two; each HAL brings them along

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import LINK, SITE, check_fault, well
+from board_lines import LINK, SITE, check_fault, packets_shown, well
 from test_board_cli import EVLCP
 
 from evlcp_sdk.air.beacons import Beacon
@@ -57,16 +57,7 @@ def messages_of(symbols: np.ndarray, link: Link = LINK) -> dict[Kind, Message]:
 
 def packets_on(leds: Path) -> np.ndarray:
     """Symbols of the packets that a board showed; what is between them is left out."""
-    chips = LedRecord.read(leds).played().chips()
-    preamble = LINK.codebook.preamble[:, None]
-    found, at = [], 0
-    while at + LINK.packet.packet_chips <= len(chips):
-        if (chips[at : at + len(preamble)] == preamble).all():
-            found.append(chips[at : at + LINK.packet.packet_chips])
-            at += LINK.packet.packet_chips
-        else:
-            at += 1
-    return symbols_of(np.concatenate(found))
+    return symbols_of(np.concatenate(packets_shown(LedRecord.read(leds).played().chips())[0]))
 
 
 def test_a_text_a_file_and_a_beacon(evlcp, site: Path, tmp_path: Path) -> None:

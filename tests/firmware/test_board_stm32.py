@@ -317,25 +317,6 @@ def symbol(name: str) -> int:
     return next(int(line.split()[0], 16) for line in table.splitlines() if line.split()[-1] == name)
 
 
-def test_a_swap_leaves_no_chip_out(bar: Bar) -> None:
-    begin = len(bar.log)
-    bar.board.start()
-    bar.chip.run(4_000)
-    other = symbols_of(2, 9, FOUR)
-    bar.board.program(bank_of(other, FOUR))
-    bar.chip.run(30_000)
-    rows, times = lit_rows(bar.log[begin:])
-    assert (np.diff(times) == CHIP).all()
-    lead = int(bar.chips.any(1).argmax())
-    after = symbol_chips(other, FOUR.codebook)
-    found = []
-    for packets in range(1, 30):
-        chips = np.vstack([np.tile(bar.chips, (packets, 1)), np.tile(after, (40, 1))])[lead:]
-        found += [packets] * bool((np.repeat(chips[: len(rows)], 6, axis=1) == rows).all())
-    assert len(found) == 1
-    assert len(rows) > (found[0] + 2) * len(bar.chips)
-
-
 def test_counters_pass_two_to_the_32(bar: Bar) -> None:
     """TIM2, the milliseconds, the chips and the packets sent all wrap while it plays."""
     chip = bar.chip

@@ -5,7 +5,17 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from board_lines import LINK, NoisyLine, board_link, board_on, shown, some_bank, state_of, symbols_of
+from board_lines import (
+    LINK,
+    NoisyLine,
+    board_link,
+    board_on,
+    packets_shown,
+    shown,
+    some_bank,
+    state_of,
+    symbols_of,
+)
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
@@ -25,20 +35,8 @@ LONG = board_link("air.frames_per_packet=40", "air.pilot_every=4")
 
 
 def played(device: SimulatedBoard, link: Link = LINK) -> tuple[list[bytes], int]:
-    """The packets that were shown, as chips, and how many chips of the idle pattern stood between them."""
-    chips = device.records().played().chips()
-    preamble = link.codebook.preamble
-    length = link.packet.packet_chips
-    found, at, idle = [], 0, 0
-    while at + length <= len(chips):
-        if (chips[at : at + len(preamble)] == preamble[:, None]).all():
-            found.append(chips[at : at + length].tobytes())
-            at += length
-        else:
-            assert (chips[at] == idle % 2).all(), f"chip {at} is neither of a packet nor of the idle pattern"
-            at += 1
-            idle += 1
-    return found, idle
+    found, idle = packets_shown(device.records().played().chips(), link)
+    return [packet.tobytes() for packet in found], idle
 
 
 def expected(packets: np.ndarray, link: Link = LINK) -> list[bytes]:
