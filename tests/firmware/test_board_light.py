@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from board_lines import LINK, board_on, shown, some_bank, state_of
+from board_lines import LINK, board_on, some_bank, state_of
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
@@ -122,7 +122,9 @@ def streams(draw: st.DrawFn) -> tuple[NDArray[np.uint8], int, float]:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     share, run = draw(st.floats(0.05, 1.0)), draw(st.integers(1, 2 * CHIPS))
     n = draw(st.integers(1, 3)) * CHIPS
-    steps = rng.random((n // run + 2, 96)) < share
+    # Of few LEDs one may be on for long at once, and for its share of the time in all.
+    lit = rng.random(96) < draw(st.sampled_from([0.03, 0.03, 1.0]))
+    steps = (rng.random((n // run + 2, 96)) < share) & lit
     rows = np.repeat(steps, run, axis=0)[:n].astype(np.uint8)
     return rows, draw(st.integers(10, 60)), draw(st.sampled_from([0.1, 0.25, 0.4, 0.5, 0.75, 1.0]))
 
@@ -167,21 +169,6 @@ def test_no_stretch_of_what_is_sent_is_beyond_the_limits(stream, stops) -> None:
     # over BLANK and START as well; dark time is counted to the millisecond
     everything = np.vstack(sent)
     assert not len(everything) or excess(everything, duty).max() <= BURST + 10 * (len(stops) > 0)
-
-
-def test_a_burst_beyond_the_limits_goes_dark_before_it_is_shown(device: SimulatedBoard, board: Board) -> None:
-    rows = np.zeros((3 * CHIPS, 96), np.uint8)
-    rows[20:160, 5] = 1  # 0.3 of the time, but at once
-    provision(board, bank_of_rows(rows), Settings(level_ma=20, duty_limit=0.54))
-    device.run(100_000)
-    # 140 * (1 - 0.54) chips are just beyond 64: the last of them is not shown
-    assert (shown(device) == rows[:159]).all()
-    assert state_of(board) == (State.FAULT, BoardFault.OVER_LIMIT)
-    board.limit(bank_of_rows(rows), duty=0.55)
-    board.start()
-    device.run(100_000)
-    assert state_of(board) == (State.PLAYING, 0)
-    assert (shown(device)[:900] == np.resize(rows, (900, 96))).all()
 
 
 def test_the_led_test_keeps_to_the_mean_current(device: SimulatedBoard, board: Board) -> None:
