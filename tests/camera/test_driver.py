@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -21,13 +22,8 @@ from evlcp_sdk.run import receive
 from evlcp_sdk.values import Events, Triggers
 
 SYSTEM = "/usr/bin/python3"
-READY = (
-    shutil.which("umockdev-wrapper")
-    and subprocess.run(
-        [SYSTEM, "-c", "import gi; gi.require_version('UMockdev', '1.0')"], capture_output=True, check=False
-    ).returncode
-    == 0
-)
+ASK = [SYSTEM, "-c", "import gi; gi.require_version('UMockdev', '1.0')"]
+READY = shutil.which("umockdev-wrapper") and not subprocess.run(ASK, capture_output=True).returncode
 emulated = pytest.mark.skipif(
     not READY, reason="needs umockdev: apt-get install umockdev gir1.2-umockdev-1.0 python3-gi"
 )
@@ -40,17 +36,10 @@ class Emulator:
     """The emulated camera, and how to run a program that sees it."""
 
     def __init__(self, words, *options):
-        command = [
-            "umockdev-wrapper",
-            SYSTEM,
-            str(Path(__file__).with_name("emulator.py")),
-            str(words),
-            *options,
-        ]
+        command = ["umockdev-wrapper", SYSTEM, Path(__file__).with_name("emulator.py"), words, *options]
         clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-        self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=clean
-        )
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=clean)
         self.lines = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()
         self.folder = self.lines.get(timeout=20)
@@ -228,11 +217,7 @@ def test_each_fault_of_the_driver_is_one_line_with_the_next_step(monkeypatch):
         ("PropheseeEvk4(RegisterReadShortResponse(4096))", "a port that gives enough power"),
         ("never seen before", "the driver says: never seen before"),
     ):
-
-        def fail(said=said):
-            raise RuntimeError(said)
-
-        monkeypatch.setattr(neuromorphic_drivers, "list_devices", fail)
+        monkeypatch.setattr(neuromorphic_drivers, "list_devices", Mock(side_effect=RuntimeError(said)))
         with pytest.raises(InputError) as fault:
             open_source("camera:")
         assert told in str(fault.value)
@@ -251,13 +236,9 @@ def test_options_are_checked(monkeypatch):
         with pytest.raises(InputError) as fault:
             open_source(url)
         assert told in str(fault.value)
-    monkeypatch.setattr(camera.importlib, "import_module", _not_there)
+    monkeypatch.setattr(camera.importlib, "import_module", Mock(side_effect=ImportError))
     with pytest.raises(ConfigError, match=r"pip install 'evlcp-sdk\[camera\]'"):
         open_source("camera:")
-
-
-def _not_there(name):
-    raise ImportError(name)
 
 
 class Flaky(EventSource):

@@ -184,17 +184,13 @@ def test_idle_keeps_to_the_limits(device: SimulatedBoard, board: Board, limit: f
 def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None:
     call, bank = board.session.call, a_bank()
     digest = bytes.fromhex(bank.digest)
-    for place, wrong, nearest in (
-        (0, 0, 1),
-        (0, 40961, 40960),
-        (0, 2**32 - 1, 40960),
-        (1, 0, 1),
-        (2, 97, 96),
+    chips = protocol.ChipsRequest(200, 1, 10, digest)
+    for name, wrong, nearest in (
+        *[("packet_chips", n, near) for n, near in ((0, 1), (40961, 40960), (2**32 - 1, 40960))],
+        *(("hold", 0, 1), ("clusters", 97, 96)),
     ):
-        values = [200, 1, 10]
-        values[place] = wrong
         with pytest.raises(RefusedError) as told:
-            call(protocol.ChipsRequest(*values, digest))
+            call(replace(chips, **{name: wrong}))
         assert (told.value.status, told.value.detail) == (Status.OUT_OF_RANGE, nearest)
     commit = protocol.CommitRequest(0, bank.format, 2, len(bank.content), bank.crc, digest)
     with pytest.raises(RefusedError):

@@ -34,14 +34,16 @@ def requirement(entry: str) -> Requirement:
     return Requirement(entry.partition(" --hash=")[0])
 
 
+def packages() -> set[tuple[str, str]]:
+    """Name and version of each."""
+    found = map(requirement, entries())
+    return {(canonicalize_name(one.name), str(one.specifier).removeprefix("==")) for one in found}
+
+
 @pytest.mark.parametrize("asked", ASKED)
 def test_what_the_project_asks_for_is_locked(asked: str) -> None:
     wanted = Requirement(asked)
-    versions = [
-        str(r.specifier).removeprefix("==")
-        for r in map(requirement, entries())
-        if canonicalize_name(r.name) == canonicalize_name(wanted.name)
-    ]
+    versions = [version for name, version in packages() if name == canonicalize_name(wanted.name)]
     assert versions, f"requirements-dev.lock lacks {wanted.name}"
     assert all(wanted.specifier.contains(version) for version in versions), (asked, versions)
 
@@ -67,17 +69,14 @@ def test_the_sbom_names_every_package_of_the_lock() -> None:
     table = json.loads(said[0])
     assert (table["bomFormat"], table["specVersion"]) == ("CycloneDX", "1.6")
     assert table["metadata"]["component"]["name"] == PROJECT["project"]["name"]
-    packages = {
-        (canonicalize_name(r.name), str(r.specifier).removeprefix("==")) for r in map(requirement, entries())
-    }
-    assert {(one["name"], one["version"]) for one in table["components"]} == packages
+    assert {(one["name"], one["version"]) for one in table["components"]} == packages()
     assert all(one["purl"] == f"pkg:pypi/{one['name']}@{one['version']}" for one in table["components"])
     refs = [one["bom-ref"] for one in table["components"]]
     assert len(set(refs)) == len(refs) > 50
     # `make test` takes the newest versions: a licence is that of the one in the lock, or not told.
     licensed = {one["name"] for one in table["components"] if "licenses" in one}
     here = {canonicalize_name(one.metadata["Name"]): one.version for one in distributions()}
-    alike = {name for name, version in packages if here.get(name) == version}
+    alike = {name for name, version in packages() if here.get(name) == version}
     assert licensed <= alike
     assert licensed >= alike & {"numpy", "scipy", "pydantic", "hatchling"} != set()
     assert "sbom:" in (ROOT / "Makefile").read_text()

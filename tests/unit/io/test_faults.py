@@ -27,12 +27,8 @@ def raw(path, words, header=HEADER, tail=b"", dtype="<u2"):
 
 def some_events(n=3000):
     rng = np.random.default_rng(2)
-    return Events.of(
-        np.sort(rng.integers(0, 10_000, n)),
-        rng.integers(0, 640, n),
-        rng.integers(0, 480, n),
-        rng.integers(0, 2, n),
-    )
+    x, y, p = (rng.integers(0, end, n) for end in (640, 480, 2))
+    return Events.of(np.sort(rng.integers(0, 10_000, n)), x, y, p)
 
 
 BAD_HEADERS = {
@@ -89,12 +85,8 @@ def test_header_without_end_is_counted(tmp_path):
 def test_header_lines_of_a_real_camera():
     lines = b"% evt 3.0\r\n% date 2024-01-01 10:00:00\n% geometry 1280x720\n% plugin\n% end\n\x01\x80"
     header = parse_header(lines, "a.raw")
-    assert header.fields == {
-        "evt": "3.0",
-        "date": "2024-01-01 10:00:00",
-        "geometry": "1280x720",
-        "plugin": "",
-    }
+    date = "2024-01-01 10:00:00"
+    assert header.fields == {"evt": "3.0", "date": date, "geometry": "1280x720", "plugin": ""}
     assert (header.codec.name, header.width, header.height) == ("EVT3", 1280, 720)
     assert (header.size_bytes, header.closed) == (len(lines) - 2, True)
 

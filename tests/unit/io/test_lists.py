@@ -70,6 +70,7 @@ LISTS = {
     "seconds, spelled": text(T_S, SIGNS, head='"timestamp (seconds)","event"', form="%.6f"),
     "as the beacon's authors call them": text(T_S, SIGNS, head="event_t,event", form="%.6f"),
     "words": text(T_US, np.where(P == 1, "ON", "OFF"), head="time_us,polarity"),
+    "words, no last line end": text(T_US, np.where(P == 1, "ON", "OFF"), head="t,p").rstrip("\n"),
     "words, no heading": text(np.where(P == 1, "ON", "OFF"), T_US, mark="\t"),
     "rising and falling": text(T_US, np.where(P == 1, "rising", "falling"), head="t,type"),
     "with an index": text(ROWS, T_US, P, head=",t,p"),

@@ -15,15 +15,8 @@ from evlcp_sdk.errors import InputError, StreamError
 from evlcp_sdk.io import open_source, open_writer, read_events, write_events
 from evlcp_sdk.values import Events, Triggers
 
-tables = st.lists(
-    st.tuples(
-        st.integers(-(10**18) + 1, 10**18 - 1),
-        st.integers(0, 65535),
-        st.integers(0, 65535),
-        st.integers(0, 1),
-    ),
-    max_size=60,
-).map(sorted)
+times, sides = st.integers(-(10**18) + 1, 10**18 - 1), st.integers(0, 65535)
+tables = st.lists(st.tuples(times, sides, sides, st.integers(0, 1)), max_size=60).map(sorted)
 
 
 def rows(events):
