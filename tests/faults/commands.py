@@ -8,12 +8,11 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import typer
@@ -36,7 +35,7 @@ from tests.unit.study.fake import fake_plan, run_fake
 HOW = ("fails", "dies", "stays full")
 ALL = "EVLCP_ALL_FAULTS" in os.environ
 
-SHIM: Any = ctypes.CDLL(os.environ.get("LD_PRELOAD"))
+SHIM = ctypes.CDLL(os.environ.get("LD_PRELOAD"))
 
 
 @dataclass(frozen=True)
@@ -48,21 +47,21 @@ class Ended:
     calls: tuple[str, ...] = ()
 
 
-def warm(*arguments: str) -> None:
+def warm(*arguments):
     """Run a command in this process, so that forks have all imports."""
     sys.argv = ["evlcp", *arguments]
     with redirect_stdout(io.StringIO()), suppress(SystemExit):
         main()
 
 
-def run(arguments: tuple[str, ...], folder: Path, at: int = -1, how: str = "fails") -> Ended:
+def run(arguments, folder, at=-1, how="fails"):
     """Run a command in a fork; its call number `at` below the folder fails."""
     inlet, outlet = os.pipe()
     # A fork that looks through all that was there before copies it, page by page.
     gc.freeze()
     pid = os.fork()
     if not pid:
-        code: Any = 70
+        code = 70
         try:
             sys.argv = ["evlcp", *arguments]
             sys.stdout, sys.stderr = io.StringIO(), io.StringIO()
@@ -86,7 +85,7 @@ def run(arguments: tuple[str, ...], folder: Path, at: int = -1, how: str = "fail
     return Ended(code, err, tuple(calls))
 
 
-def held(folder: Path) -> dict[str, bytes]:
+def held(folder):
     """What a folder holds, by name, without what differs from run to run."""
     found = {}
     for path in sorted(folder.iterdir()):
@@ -100,14 +99,14 @@ def held(folder: Path) -> dict[str, bytes]:
     return found
 
 
-def faults_of(calls: Sequence[str], every: int = 1) -> Iterator[tuple[str, int, str]]:
+def faults_of(calls, every=1):
     """How and where a call fails, in words: one in `every`, one way each in turn, or all in all ways."""
     faults = [(how, at) for at in range(len(calls)) for how in (HOW if ALL else (HOW[at % len(HOW)],))]
     for how, at in faults[:: 1 if ALL else every]:
         yield how, at, f"{how} at {at} ({calls[at]})"
 
 
-def is_told(ended: Ended) -> bool:
+def is_told(ended):
     """A command that could not write says so in one line, unless it was killed."""
     line = ended.err.count("\n") == 1 and ": cannot be written: " in ended.err
     return ended.code in (None, 0) or (ended.code == 1 and line)
@@ -133,7 +132,7 @@ class Trial:
     stale: tuple[str, ...] = ()
     every: int = 1
 
-    def faults(self, work: Path) -> tuple[list[str], tuple[str, ...]]:
+    def faults(self, work):
         """What is wrong after each fault: a result that is not whole and true, nor flagged; and all calls."""
         before, out = work / "before", work / "out"
         before.mkdir()
@@ -155,7 +154,7 @@ class Trial:
             wrong += [f"{words}, {met}: {text}" for text in self._wrong(met, out, *whole)]
         return wrong, ended.calls
 
-    def _wrong(self, ended: Ended, out: Path, old: dict[str, bytes], new: dict[str, bytes]) -> Iterator[str]:
+    def _wrong(self, ended, out, old, new):
         found = held(out)
         if ended.code == 0 and found != new:
             yield "says that it is done, and is not"
@@ -177,7 +176,7 @@ class Trial:
             yield f"torn: {sorted(found)}"
 
 
-def check_result(folder: Path) -> None:
+def check_result(folder):
     summary = read_summary(folder)
     for name in summary["files"]:
         check_result_file(folder, name, summary)
@@ -188,33 +187,33 @@ class StandIn:
 
     packets: tuple[Packet, ...] = ()
 
-    def __init__(self, *_: object) -> None:
-        self.counts: dict[str, int] = {}
-        self.lit_us: dict[int, tuple[float, float]] = {}
-        self.link_counts: dict[str, dict[str, int]] = {}
+    def __init__(self, *_):
+        self.counts = {}
+        self.lit_us = {}
+        self.link_counts = {}
 
-    def feed(self, _events: Events) -> list[Packet]:
+    def feed(self, _events):
         return []
 
-    def close(self) -> list[Packet]:
+    def close(self):
         return list(self.packets)
 
 
-def receive(work: Path, demo: Path, *more: str) -> Trial:
+def receive(work, demo, *more):
     """Two recordings, one after the other, into one folder."""
     with evlcp_sdk.run.receive(demo) as packets:
         StandIn.packets = (next(packets),)
-        StandIn.counts = packets.counts  # type: ignore[attr-defined]
+        StandIn.counts = packets.counts
     counts = packets.counts
 
-    def stand_in(*_: object, **_more: object) -> StandIn:
+    def stand_in(*_, **_more):
         made = StandIn()
         made.counts = counts
         if "two.raw" not in sys.argv[2]:
             made.packets = ()
         return made
 
-    evlcp_sdk.run.Receiver = stand_in  # type: ignore[assignment,misc]
+    evlcp_sdk.run.Receiver = stand_in
     events = Events.of(np.arange(50, dtype=np.int64), *(np.zeros((3, 50), np.int64)))
     for name in ("one.raw", "two.raw"):
         write_events(work / name, events, 1280, 720)
@@ -223,7 +222,7 @@ def receive(work: Path, demo: Path, *more: str) -> Trial:
     return Trial(*arguments, "summary.json", check_result, stale)
 
 
-def sinks(work: Path, demo: Path) -> Trial:
+def sinks(work, demo):
     """The same with every format that one may ask for; pictures of one colour, drawn at once."""
     picture = Figure(figsize=(0.1, 0.1))
     for name in ("draw_regions", "draw_presence", "draw_plots"):
@@ -236,38 +235,38 @@ def sinks(work: Path, demo: Path) -> Trial:
     return trial
 
 
-def simulate(_work: Path, _demo: Path) -> Trial:
+def simulate(_work, _demo):
     """A recording and its truth over another one's."""
     short = ("--set", "duration_s=0.001", "--set", "camera.width=200", "--set", "camera.height=100")
     arguments = [("simulate", "--preset", "night", "-o", "OUT/a.raw", *short, "--seed", n) for n in "12"]
     return Trial(*arguments, "a.truth.json")
 
 
-def tx(_work: Path, _demo: Path) -> Trial:
+def tx(_work, _demo):
     """Symbols and chips over those of another message."""
     files = ("-o", "OUT/m.json", "--chips", "OUT/c.npy", "--sequence", "1")
     return Trial(*(("tx", "message", "--text", text, *files) for text in ("a", "b")), "m.json")
 
 
-def sweep(work: Path) -> tuple[list[str], tuple[str, ...]]:
+def sweep(work):
     """A campaign that meets a fault is whole after the same command once more; what was kept is true."""
     plan = fake_plan(2, 1, 1)
-    task.plan_of = lambda *_: plan  # type: ignore[assignment]
+    task.plan_of = lambda *_: plan
     task.run_job = run_fake
     out = work / "out"
     arguments = ("sweep", "campaign.toml", "-o", str(out / "r.sqlite"), "--workers", "0")
 
-    def fresh(at: int = -1, how: str = "fails") -> Ended:
+    def fresh(at=-1, how="fails"):
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir()
         return run(arguments, out, at, how)
 
-    def collected(path: Path) -> Any:
+    def collected(path):
         with Store(path, create=True) as store:
             collect(plan, store, Inline(), run_fake)
             return store.results()
 
-    def kept() -> Any:
+    def kept():
         try:
             with Store(out / "r.sqlite") as store:
                 return store.results()
@@ -295,7 +294,7 @@ def sweep(work: Path) -> tuple[list[str], tuple[str, ...]]:
     return faults, calls
 
 
-def tell(name: str, work: Path, demo: Path) -> None:
+def tell(name, work, demo):
     # Looked up once for all forks.
     typer.main.get_params_from_function = cache(typer.main.get_params_from_function)
     trials = {"receive": receive, "sinks": sinks, "simulate": simulate, "tx": tx}

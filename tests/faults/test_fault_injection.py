@@ -20,7 +20,7 @@ needs_compiler = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shim(tmp_path_factory):
     path = tmp_path_factory.mktemp("shim") / "shim.so"
     command = ["cc", "-O1", "-Wall", "-Werror", "-shared", "-fPIC", "-o", path, HERE / "shim.c", "-ldl"]
     subprocess.run(command, check=True)
@@ -29,7 +29,7 @@ def shim(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @needs_compiler
 @pytest.mark.parametrize("command", ["receive", "sinks", "simulate", "tx", "sweep"])
-def test_a_disk_that_fails_once(command: str, shim: Path, tmp_path: Path, demo_raw: Path) -> None:
+def test_a_disk_that_fails_once(command, shim, tmp_path, demo_raw):
     if command == "sinks":
         pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
         pytest.importorskip("mcap", reason="the extra mcap is not installed")

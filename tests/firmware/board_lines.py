@@ -2,26 +2,22 @@
 
 import shutil
 import threading
-from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from evlcp_sdk.link.resolve import Link, load_link
-from firmware_host.board.bank import Bank, bank_of, random_symbols, symbol_chips
+from evlcp_sdk.link.resolve import load_link
+from firmware_host.board.bank import bank_of, random_symbols, symbol_chips
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
-from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.listening import HostLine
 from firmware_host.emulators.native import NativeBoard, serve
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.datagram import Datagram
-from tests.conftest import Run
 
 PACKET = 346
 LINK = load_link()
@@ -35,7 +31,7 @@ height_m = 52.4
 """
 
 
-def needs(*tools: str) -> None:
+def needs(*tools):
     """Skip, loudly, unless all these programs are there."""
     missing = [name for name in tools if shutil.which(name) is None]
     if missing:
@@ -43,45 +39,45 @@ def needs(*tools: str) -> None:
         pytest.skip(f"{', '.join(missing)} missing: {install}")
 
 
-def board_link(*overrides: str) -> Link:
+def board_link(*overrides):
     """The default link but for these values."""
     return load_link(overrides=list(overrides))
 
 
-def options_of(*overrides: str) -> list[str]:
+def options_of(*overrides):
     """The same on the command line."""
     return [part for setting in overrides for part in ("--set", setting)]
 
 
-def symbols_of(packets: int, seed: int = 0, link: Link = LINK) -> NDArray[np.int64]:
+def symbols_of(packets, seed=0, link=LINK):
     """Random symbols of packets of a link."""
     return random_symbols(packets, link.packet.frames, link.codebook, np.random.default_rng(seed))
 
 
-def some_bank(packets: int = 1, seed: int = 0, link: Link = LINK) -> Bank:
+def some_bank(packets=1, seed=0, link=LINK):
     """Random packets of a link."""
     return bank_of(symbols_of(packets, seed, link), link)
 
 
-def board_on(line: SimulatedLine | SimulatedBoard, nonce: int | None = None, **options: Any) -> Board:
+def board_on(line, nonce=None, **options):
     """A session; with a nonce of one's own its bytes are the same each time."""
     timing = Timing(latency_s=options.pop("latency_s", 0.02))
     line = SimulatedLine(line) if isinstance(line, SimulatedBoard) else line
     return Board(Session(line, timing, first=nonce, nonce=nonce, **options))
 
 
-def state_of(board: Board) -> tuple[int, int]:
+def state_of(board):
     """State and faults."""
     status = board.status()
     return status.state, status.faults
 
 
-def shown(device: SimulatedBoard) -> NDArray[np.uint8]:
+def shown(device):
     """What each LED did since the last look, uint8 (chips, 96)."""
     return device.records().played().chips(None)
 
 
-def packets_shown(chips: NDArray[np.uint8], link: Link = LINK) -> tuple[list[NDArray[np.uint8]], int]:
+def packets_shown(chips, link=LINK):
     """The packets that were shown, and how many chips of the idle pattern stood between them."""
     preamble, length = link.codebook.preamble[:, None], link.packet.packet_chips
     found, at, idle = [], 0, 0
@@ -96,13 +92,13 @@ def packets_shown(chips: NDArray[np.uint8], link: Link = LINK) -> tuple[list[NDA
     return found, idle
 
 
-def well(done: Run) -> Run:
+def well(done):
     """A command that has ended well."""
     assert done.code == 0, done.err
     return done
 
 
-def check_fault(done: Run, code: int, *says: str) -> None:
+def check_fault(done, code, *says):
     """See that a command ended with a code, and one line that says why."""
     assert (done.code, done.err.count("\n")) == (code, 1), done.err
     assert [words for words in says if words not in done.err] == [], done.err
@@ -116,7 +112,7 @@ class Vector(NamedTuple):
     wire: bytes
 
 
-def read_vectors() -> Iterator[Vector]:
+def read_vectors():
     """The golden vectors: `name type status sequence session payload wire` in hex, `-` for no payload."""
     path = Path(__file__).parents[1] / "vectors" / "wire-vectors.txt"
     for line in path.read_text(encoding="ascii").splitlines():
@@ -129,13 +125,13 @@ def read_vectors() -> Iterator[Vector]:
 class Native:
     """A native board in the background, as `evlcp board emulate native` runs it; options are its own."""
 
-    def __init__(self, listen: str, **options: Any) -> None:
+    def __init__(self, listen, **options):
         self.board, self.line = NativeBoard(**options), HostLine(listen)
         self.ended = threading.Event()
         self.thread = threading.Thread(target=serve, args=(self.board, self.line, self.ended.is_set))
         self.thread.start()
 
-    def end(self) -> None:
+    def end(self):
         if self.ended.is_set():
             return
         self.ended.set()
@@ -148,13 +144,13 @@ class Native:
 class FatalLine(SimulatedLine):
     """Calls `then` once `after` bytes have gone to the board; the bytes before have arrived."""
 
-    def __init__(self, board: SimulatedBoard, after: int, then: Callable[["FatalLine"], object]) -> None:
+    def __init__(self, board, after, then):
         super().__init__(board)
-        self.left: int | None = after
+        self.left = after
         self.then = then
         self.written = b""
 
-    def write(self, data: bytes) -> None:
+    def write(self, data):
         self.written += data
         if self.left is not None:
             now, data = data[: self.left], data[self.left :]
@@ -168,27 +164,27 @@ class FatalLine(SimulatedLine):
         super().write(data)
 
 
-def recording(board: SimulatedBoard) -> FatalLine:
+def recording(board):
     """A line that keeps what was written, and never fails."""
     return FatalLine(board, 1 << 30, lambda _: None)
 
 
-def deafen(line: SimulatedLine) -> None:
+def deafen(line):
     """Let nothing arrive at the board from now on."""
-    line.to_board = lambda _: b""  # type: ignore[method-assign]
+    line.to_board = lambda _: b""
 
 
 class NoisyLine(SimulatedLine):
     """Flips, drops and doubles bytes and whole portions, both ways."""
 
-    def __init__(self, board: SimulatedBoard, flips: float, drops: float, doubles: float, seed: int) -> None:
+    def __init__(self, board, flips, drops, doubles, seed):
         super().__init__(board, step_us=500)
         self.rates = (flips, drops, doubles)
         self.random = np.random.default_rng(seed)
         self.counts = {"flipped": 0, "dropped": 0, "doubled": 0}
-        self.late: list[bytes] = []
+        self.late = []
 
-    def spoil(self, data: bytes) -> bytes:
+    def spoil(self, data):
         flips, drops, doubles = self.rates
         body = np.frombuffer(data, np.uint8).copy()
         flip = self.random.random(len(body)) < flips
@@ -216,7 +212,7 @@ class NoisyLine(SimulatedLine):
     to_board = to_host = spoil
 
 
-def packet_sequence(played: LedRecord, payloads: dict[str, NDArray[np.int64]]) -> list[tuple[str, int]]:
+def packet_sequence(played, payloads):
     """Name and packet number of every whole packet that was played; fails on one that is none of them."""
     known = {}
     for name, symbols in payloads.items():
@@ -234,7 +230,7 @@ def packet_sequence(played: LedRecord, payloads: dict[str, NDArray[np.int64]]) -
     return sequence
 
 
-def check_order(sequence: list[tuple[str, int]], counts: dict[str, int]) -> list[str]:
+def check_order(sequence, counts):
     """Packets of one payload follow round and round; another begins with its first. Returns the payloads."""
     order = [sequence[0][0]]
     assert sequence[0][1] == 0

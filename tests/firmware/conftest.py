@@ -1,27 +1,20 @@
 """Boards for the tests of the transmitter, and what of a developer's environment they must not see."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from board_lines import Native, board_on, needs
 
 from firmware_host import build
-from firmware_host.board.board import Board
 from firmware_host.emulators.simulated import SimulatedBoard
-from firmware_host.images import FlashImage
-
-if TYPE_CHECKING:
-    from tests.models.stm32 import Stm32
 
 SANITIZED = "EVLCP_TEST_LIBRARY"
 """Names a library of the firmware, for tests that run in another process."""
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _library() -> None:
+def _library():
     """Skip without what builds the native board; take the one under sanitizers, where that is named."""
     needs("cc", "make")
     if path := os.environ.get(SANITIZED):
@@ -29,24 +22,24 @@ def _library() -> None:
 
 
 @pytest.fixture(autouse=True)
-def _no_port_and_a_wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_port_and_a_wide_terminal(monkeypatch):
     monkeypatch.delenv("EVLCP_PORT", raising=False)
     monkeypatch.setenv("COLUMNS", "200")
 
 
 @pytest.fixture
-def device() -> SimulatedBoard:
+def device():
     return SimulatedBoard()
 
 
 @pytest.fixture
-def board(device: SimulatedBoard) -> Board:
+def board(device):
     """A session with `device`."""
     return board_on(device)
 
 
 @pytest.fixture
-def native(tmp_path: Path) -> Iterator[str]:
+def native(tmp_path):
     """The port of a native board that runs; its files are leds.bin and flash.bin."""
     place = f"unix:{tmp_path / 'board'}"
     emulated = Native(place, leds=tmp_path / "leds.bin", flash=tmp_path / "flash.bin")
@@ -55,15 +48,13 @@ def native(tmp_path: Path) -> Iterator[str]:
 
 
 @pytest.fixture(scope="session")
-def stm32() -> "Callable[..., tuple[Stm32, Board]]":
+def stm32():
     """What starts an image on the model of the part, and connects to it."""
     needs("arm-none-eabi-gcc")
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
     from tests.models.stm32 import Stm32, connect
 
-    def started(
-        image: FlashImage | None = None, hse_hz: int = 8_000_000, pulses: Sequence[float] = ()
-    ) -> "tuple[Stm32, Board]":
+    def started(image=None, hse_hz=8_000_000, pulses=()):
         chip = Stm32(image or build.arm_image("stm32f405"), hse_hz)
         for time in pulses:
             chip.pulse_at(time)

@@ -2,20 +2,17 @@
 
 import zlib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from board_lines import board_link, board_on, check_fault, options_of, shown, some_bank, symbols_of, well
 from hypothesis import given, settings, strategies as st
-from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook, hadamard
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import Link
 from firmware_host.board.bank import Bank, bank_of, random_symbols, symbol_chips
-from firmware_host.board.board import Board, Settings, profile_number, provision
+from firmware_host.board.board import Settings, profile_number, provision
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import IncompatibleError, RefusedError
 from firmware_host.protocol.generated import requests as protocol
@@ -26,7 +23,7 @@ LED_CLUSTERS = np.random.default_rng(4).permutation(np.repeat(np.arange(10), SIZ
 """87 LEDs in ten clusters of other sizes, side by side in no order: the cluster of each LED."""
 
 
-def book_of(clusters: int, values: int) -> Codebook:
+def book_of(clusters, values):
     """Codes of `2 * values` chips, drawn at random."""
     rng = np.random.default_rng(values)
     codes = np.unique(rng.choice(np.array([-1, 1], np.int8), (4 * clusters + 64, values)), axis=0)
@@ -39,11 +36,11 @@ BOOK = book_of(10, 12)
 SYMBOLS = random_symbols(2, 3, BOOK, np.random.default_rng(1))
 
 
-def a_bank(**changes: float) -> Bank:
+def a_bank(**changes):
     return Bank.of_symbols(SYMBOLS, BOOK, 2, led_clusters=LED_CLUSTERS, **changes)
 
 
-def leds_of(chips: NDArray[np.uint8], led_clusters: NDArray[np.int64]) -> NDArray[np.uint8]:
+def leds_of(chips, led_clusters):
     """What the 96 outputs do for chips of clusters, uint8 (chips, 96); without the code that is tested."""
     found = np.zeros((len(chips), 96), np.uint8)
     for led, cluster in enumerate(led_clusters):
@@ -51,7 +48,7 @@ def leds_of(chips: NDArray[np.uint8], led_clusters: NDArray[np.int64]) -> NDArra
     return found
 
 
-def check_round(rows: NDArray[np.uint8], expected: NDArray[np.uint8], least: int) -> None:
+def check_round(rows, expected, least):
     """Rows are these LEDs', round and round, and none beyond them is lit."""
     assert len(rows) >= least
     leds = expected.shape[1]
@@ -63,7 +60,7 @@ EXPECTED = leds_of(symbol_chips(SYMBOLS, BOOK, 2), LED_CLUSTERS)
 """80 chips of preamble, two pilots and three words of 24: twice."""
 
 
-def check_plays(device: SimulatedBoard, board: Board, bank: Bank, leds: NDArray[np.uint8]) -> None:
+def check_plays(device, board, bank, leds):
     """The board takes a bank, within the very share of time that it has a LED on, and its LEDs play it."""
     share = np.ceil(1000 * leds.mean(0).max() - 1e-9)
     done = provision(board, bank, Settings(duty_limit=share / 1000))
@@ -100,7 +97,7 @@ ONE_LED = ("bar.rows=1", "bar.cluster_rows=1", "ranging.id=none")
     ],
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else value.name,
 )
-def test_every_led_does_what_it_is_sent(device, board, form, overrides) -> None:
+def test_every_led_does_what_it_is_sent(device, board, form, overrides):
     link = board_link(*overrides)
     symbols = symbols_of(2, 1, link)
     chips = np.concatenate([packet_chips(one, link.codebook, link.packet.pilot_every) for one in symbols])
@@ -118,7 +115,7 @@ def test_every_led_does_what_it_is_sent(device, board, form, overrides) -> None:
     assert board.status().faults == 0
 
 
-def test_own_codes_are_composed_too(device: SimulatedBoard, board: Board) -> None:
+def test_own_codes_are_composed_too(device, board):
     rows, values = hadamard(8), np.array([1, 1, 1, -1, 1], np.int8)
     book = Codebook.of_values("wh8", values, np.concatenate([-rows, rows]), rows)
     symbols = random_symbols(2, 3, book, np.random.default_rng(0))
@@ -129,7 +126,7 @@ def test_own_codes_are_composed_too(device: SimulatedBoard, board: Board) -> Non
 
 @given(st.data())
 @settings(max_examples=25, deadline=None)
-def test_any_clusters_of_any_leds(data: st.DataObject) -> None:
+def test_any_clusters_of_any_leds(data):
     """Clusters of any number and order, chips of any kind and length: every LED against NumPy."""
     device = SimulatedBoard()
     board = board_on(device)
@@ -149,7 +146,7 @@ def test_any_clusters_of_any_leds(data: st.DataObject) -> None:
     assert board.status().duty == bank.duty == np.ceil(1000 * chips.mean(0).max() - 1e-9)
 
 
-def test_a_bank_is_full_to_the_last_byte(device: SimulatedBoard, board: Board) -> None:
+def test_a_bank_is_full_to_the_last_byte(device, board):
     """Ten clusters: 12 bytes each, then two bytes a chip; 20 420 chips fill 40 960 bytes, 2 s of light."""
     chips = np.random.default_rng(5).integers(0, 2, (20_420, 10), dtype=np.uint8)
     packet = replace(PacketFormat.of(BOOK, 1), preamble_chips=len(chips) - 48)
@@ -168,7 +165,7 @@ def test_a_bank_is_full_to_the_last_byte(device: SimulatedBoard, board: Board) -
 
 
 @pytest.mark.parametrize(("limit", "every"), [(0.5, 2), (0.3, 4), (0.001, 1000)])
-def test_idle_keeps_to_the_limits(device: SimulatedBoard, board: Board, limit: float, every: int) -> None:
+def test_idle_keeps_to_the_limits(device, board, limit, every):
     """LEDs are on for no more of it than they may be, whatever the length of a packet."""
     packet = replace(PacketFormat.of(BOOK, 1), preamble_chips=103)
     bank = Bank.of_chips(np.zeros((151, 10), np.uint8), BOOK, packet, LED_CLUSTERS)
@@ -181,7 +178,7 @@ def test_idle_keeps_to_the_limits(device: SimulatedBoard, board: Board, limit: f
     assert board.status().faults == BoardFault.WATCHDOG
 
 
-def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None:
+def test_what_the_firmware_refuses(device, board):
     call, bank = board.session.call, a_bank()
     digest = bytes.fromhex(bank.digest)
     chips = protocol.ChipsRequest(200, 1, 10, digest)
@@ -229,8 +226,8 @@ def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None
     check_round(shown(device), EXPECTED, 400)
 
 
-def test_what_hello_says_decides(board: Board) -> None:
-    def says(**changes: int) -> None:
+def test_what_hello_says_decides(board):
+    def says(**changes):
         for name, value in changes.items():
             object.__setattr__(board.about, name, value)
 
@@ -256,7 +253,7 @@ def test_what_hello_says_decides(board: Board) -> None:
     assert board.status().requests == requests + 1
 
 
-def test_chips_that_the_board_has_none_as_long_as(device: SimulatedBoard, board: Board) -> None:
+def test_chips_that_the_board_has_none_as_long_as(device, board):
     object.__setattr__(board.about, "chip_rate_min_hz", 1282)
     bank = a_bank(chip_rate_hz=500)
     provision(board, bank, Settings())
@@ -294,7 +291,7 @@ ANY = ("bar.rows=90", "bar.cluster_rows=9", "pilots.id=barker13")
 OPTIONS = options_of(*ANY)
 
 
-def test_the_commands(evlcp, tmp_path: Path, device: SimulatedBoard, board: Board) -> None:
+def test_the_commands(evlcp, tmp_path, device, board):
     link = board_link(*ANY)
     symbols = symbols_of(2, 3, link)
     provision(board, bank_of(symbols, link), Settings())
@@ -329,7 +326,7 @@ TURNED = [*LAMP, "framing.parity=odd", "framing.idle=off", "framing.first_bit=hi
 PULSES = ["modulation.id=ppm", "bar.rows=48"]
 
 
-def serial_chips(text: bytes, bits: int, odd: int, stops: int, turned: bool = False) -> list[int]:
+def serial_chips(text, bits, odd, stops, turned=False):
     """Characters as a serial port sends them behind a pause of 16 bits: marks are ones.
 
     Turned, the highest bit goes first, by an LED that is dark in pauses: a start bit lights it.
@@ -341,7 +338,7 @@ def serial_chips(text: bytes, bits: int, odd: int, stops: int, turned: bool = Fa
     return [chip ^ turned for chip in chips]
 
 
-def packet_of(kind: str) -> tuple[Link, NDArray[np.int64], NDArray[np.uint8]]:
+def packet_of(kind):
     """A link, a packet's symbols, and the chips of its LEDs, (chips, LEDs)."""
     if kind == "4-PPM":
         link = board_link(*PULSES, "air.frames_per_packet=3")
@@ -359,13 +356,13 @@ KINDS = ["7E2", "8O1, turned", "4-PPM"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_characters_and_pulses_are_those_of_the_link(kind: str, device: SimulatedBoard, board: Board) -> None:
+def test_characters_and_pulses_are_those_of_the_link(kind, device, board):
     link, symbols, told = packet_of(kind)
     check_plays(device, board, bank_of(symbols[None], link), told)
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "ten clusters"])
-def test_the_image_of_the_part_plays_them_too(kind: str, stm32) -> None:
+def test_the_image_of_the_part_plays_them_too(kind, stm32):
     """The image as it is flashed; rows as they are latched, from the first lit one on."""
     from tests.models.stm32 import US, Dma, lit_rows
 
@@ -385,7 +382,7 @@ def test_the_image_of_the_part_plays_them_too(kind: str, stm32) -> None:
 
 
 @pytest.mark.parametrize("kind", ["7E2", "8O1, turned"])
-def test_a_stream_rests_while_nothing_is_sent(kind: str, device: SimulatedBoard, board: Board) -> None:
+def test_a_stream_rests_while_nothing_is_sent(kind, device, board):
     """The board's idle pattern would be characters: packets of pause keep it from being shown."""
     link, symbols, told = packet_of(kind)
     with board.stream(link) as stream:
@@ -405,7 +402,7 @@ def test_a_stream_rests_while_nothing_is_sent(kind: str, device: SimulatedBoard,
     assert not device.shown().any()
 
 
-def test_what_would_be_characters_is_refused(board: Board) -> None:
+def test_what_would_be_characters_is_refused(board):
     link, symbols, _ = packet_of("7E2")
     bank = bank_of(symbols[None], link)
     with pytest.raises(ConfigError, match="watchdog = idle: LEDs that are on for a chip of two say"):

@@ -10,8 +10,6 @@ import socket
 import subprocess
 import sys
 import tty
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,23 +32,23 @@ EVLCP = [sys.executable, "-c", "from evlcp_sdk.cli.main import main; main()"]
 class Emulated:
     """`evlcp board emulate` in the background."""
 
-    def __init__(self, *options: object) -> None:
+    def __init__(self, *options):
         command = [*EVLCP, "board", "emulate", *map(str, options)]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL)
         self.said = self.process.stdout.readline()
 
-    def end(self) -> int:
+    def end(self):
         self.process.send_signal(signal.SIGTERM)
         code = self.process.wait(10)
         self.process.stdout.close()
         return code
 
 
-def test_a_users_first_hour(evlcp, native: str, tmp_path: Path) -> None:
-    def board(*arguments: object) -> Run:
+def test_a_users_first_hour(evlcp, native, tmp_path):
+    def board(*arguments):
         return evlcp("board", *arguments, "--port", native)
 
-    def table(*arguments: object, **expected: object) -> None:
+    def table(*arguments, **expected):
         done = board(*arguments, "--json")
         assert (done.code, done.err) == (0, ""), arguments
         assert expected.items() <= json.loads(done.out).items(), arguments
@@ -100,11 +98,11 @@ def test_a_users_first_hour(evlcp, native: str, tmp_path: Path) -> None:
     assert (tmp_path / "flash.bin").stat().st_size > 80_000
 
 
-def test_every_command_on_a_board_takes_json_and_a_line() -> None:
+def test_every_command_on_a_board_takes_json_and_a_line():
     from firmware_host.commands import board, tx
 
     for app in (board.app, tx.app):
-        for name, command in typer.main.get_command(app).commands.items():  # type: ignore[attr-defined]
+        for name, command in typer.main.get_command(app).commands.items():
             # frames says it by --format json; an emulator runs in the foreground
             options = {option for parameter in command.params for option in parameter.opts}
             assert "--json" in options or name in ("frames", "emulate"), name
@@ -153,7 +151,7 @@ EMULATE = ("board", "emulate", "native")
         (("loop", "--set", "air.chip_rate_hz=12.5"), 2, None, "expected whole chips per second"),
     ],
 )
-def test_a_fault_is_one_line_and_json_too(evlcp, tmp_path, monkeypatch, arguments, code, kind, says) -> None:
+def test_a_fault_is_one_line_and_json_too(evlcp, tmp_path, monkeypatch, arguments, code, kind, says):
     monkeypatch.chdir(tmp_path)
     done = evlcp(*arguments, *["--json"] * (kind is not None))
     check_fault(done, code, says)
@@ -171,14 +169,14 @@ def test_a_fault_is_one_line_and_json_too(evlcp, tmp_path, monkeypatch, argument
         (("tx", "message", "--text", "hi", "--id", "-1"), "--id"),
     ],
 )
-def test_a_fault_of_usage(evlcp, arguments: tuple[str, ...], says: str) -> None:
+def test_a_fault_of_usage(evlcp, arguments, says):
     done = evlcp(*arguments, "--json")
     assert (done.code, says in done.err, "Traceback" in done.err) == (2, True, False)
     assert json.loads(done.out)["error"]["kind"] == "UsageError"
     assert "'ports' takes no --port" in evlcp("board", "--port", "x", "ports").err
 
 
-def test_wrong_records_are_told(evlcp, tmp_path: Path) -> None:
+def test_wrong_records_are_told(evlcp, tmp_path):
     torn, out = tmp_path / "leds.bin", tmp_path / "c.npy"
     records = np.zeros(3, RECORD)
     records["chip"] = (0, 1, 3)
@@ -197,7 +195,7 @@ def test_wrong_records_are_told(evlcp, tmp_path: Path) -> None:
     assert len(np.load(out)) == 2
 
 
-def test_a_record_that_is_written_is_the_one_that_is_read(tmp_path: Path) -> None:
+def test_a_record_that_is_written_is_the_one_that_is_read(tmp_path):
     """Ticks wrap, and are unwrapped."""
     made = np.zeros(4, RECORD)
     made["tick"], made["chip"] = (2**32 - 2500, 0, 2500, 5000), range(4)
@@ -210,7 +208,7 @@ def test_a_record_that_is_written_is_the_one_that_is_read(tmp_path: Path) -> Non
     assert len(LedRecord.of_records(made[:0])) == 0
 
 
-def test_trace_and_replay(evlcp, tmp_path: Path) -> None:
+def test_trace_and_replay(evlcp, tmp_path):
     trace = tmp_path / "wire.jsonl"
     arguments = ("board", "program", "--random", 8, "--seed", 3)
     live = well(evlcp(*arguments, "--port", "native:", "--trace", trace))
@@ -232,7 +230,7 @@ def test_trace_and_replay(evlcp, tmp_path: Path) -> None:
         check_fault(evlcp(*arguments, "--replay", trace), 3, f"{trace}: {says}")
 
 
-def test_line_options_stand_anywhere(evlcp, native, tmp_path, monkeypatch) -> None:
+def test_line_options_stand_anywhere(evlcp, native, tmp_path, monkeypatch):
     before = evlcp("board", "--port", native, "hello", "--json")
     behind = evlcp("board", "hello", "--json", "--port", native)
     assert json.loads(before.out)["unique_id"] == json.loads(behind.out)["unique_id"]
@@ -247,7 +245,7 @@ def test_line_options_stand_anywhere(evlcp, native, tmp_path, monkeypatch) -> No
     well(evlcp("board", "--replay", trace, "status"))
 
 
-def test_no_place_to_build_is_told(tmp_path: Path) -> None:
+def test_no_place_to_build_is_told(tmp_path):
     """In a process of its own: this one has built it."""
     (tmp_path / "file").write_text("")
     env = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "file")}
@@ -256,7 +254,7 @@ def test_no_place_to_build_is_told(tmp_path: Path) -> None:
     check_fault(Run(done.returncode, done.stdout, done.stderr), 1, "set XDG_CACHE_HOME")
 
 
-def test_an_emulator_does_not_take_anothers_place(evlcp, native: str, tmp_path: Path) -> None:
+def test_an_emulator_does_not_take_anothers_place(evlcp, native, tmp_path):
     for emulator in ("native", "stm32", "rom"):
         done = evlcp("board", "emulate", emulator, "--listen", native)
         says = f"--listen {native}: another program answers there; end it, or listen elsewhere"
@@ -272,7 +270,7 @@ def test_an_emulator_does_not_take_anothers_place(evlcp, native: str, tmp_path: 
     assert emulated.end() == 0
 
 
-def test_pty_and_tcp(evlcp, tmp_path: Path) -> None:
+def test_pty_and_tcp(evlcp, tmp_path):
     emulated = Emulated("native", "--listen", "pty", "--link", tmp_path / "tty")
     assert emulated.said == f"listening on {tmp_path / 'tty'}\n"
     done = evlcp("board", "program", "--random", 64, "--port", tmp_path / "tty")
@@ -287,7 +285,7 @@ def test_pty_and_tcp(evlcp, tmp_path: Path) -> None:
     assert emulated.end() == 0
 
 
-def test_ports_are_asked(native: str, tmp_path: Path) -> None:
+def test_ports_are_asked(native, tmp_path):
     silent, other = pty.openpty()
     tty.setraw(other)
     listed = [SerialPort(p, usb="0403:6015") for p in (os.ttyname(other), native, "/dev/nowhere")]
@@ -304,7 +302,7 @@ def test_ports_are_asked(native: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("option", ["--listen", "--link"])
-def test_an_emulator_leaves_a_users_file_alone(evlcp, tmp_path: Path, option: str) -> None:
+def test_an_emulator_leaves_a_users_file_alone(evlcp, tmp_path, option):
     path = tmp_path / "notes.txt"
     path.write_text("mine")
     place = f"unix:{path}" if option == "--listen" else path
@@ -312,11 +310,11 @@ def test_an_emulator_leaves_a_users_file_alone(evlcp, tmp_path: Path, option: st
     assert path.read_text() == "mine"
 
 
-def test_a_flash_file_is_replaced_whole(tmp_path: Path) -> None:
+def test_a_flash_file_is_replaced_whole(tmp_path):
     flash, place, payload = tmp_path / "flash.bin", f"unix:{tmp_path / 'board'}", some_bank()
 
     @contextlib.contextmanager
-    def started() -> "Iterator[tuple[Emulated, Board]]":
+    def started():
         emulated = Emulated("native", "--listen", place, "--flash", flash)
         try:
             with Session(open_transport(place)) as session:
@@ -358,7 +356,7 @@ def test_a_flash_file_is_replaced_whole(tmp_path: Path) -> None:
         ("long.bin", "long.bin: not a flash file of"),
     ],
 )
-def test_a_flash_file_that_cannot_be_used_is_left_alone(evlcp, tmp_path: Path, name: str, says: str) -> None:
+def test_a_flash_file_that_cannot_be_used_is_left_alone(evlcp, tmp_path, name, says):
     (tmp_path / "folder").mkdir()
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "long.bin").write_bytes(bytes(100_000))

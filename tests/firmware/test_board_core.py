@@ -15,15 +15,15 @@ from tests.firmware.conftest import SANITIZED
 TESTS = Path(__file__).parent / "c" / "Makefile"
 
 
-def run(*command: str, timeout: float = 300) -> "subprocess.CompletedProcess[str]":
+def run(*command, timeout=300):
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
 
 
-def make(folder: Path, *targets: str) -> "subprocess.CompletedProcess[str]":
+def make(folder, *targets):
     return run("make", "-s", "-C", str(build.FIRMWARE), "-f", str(TESTS), f"BUILD={folder}", *targets)
 
 
-def test_requests_under_sanitizers(tmp_path: Path) -> None:
+def test_requests_under_sanitizers(tmp_path):
     done = make(tmp_path, "sanitized")
     assert done.returncode == 0, done.stderr
     environment = os.environ | {
@@ -37,7 +37,7 @@ def test_requests_under_sanitizers(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_fuzzer_finds_no_fault(tmp_path: Path) -> None:
+def test_fuzzer_finds_no_fault(tmp_path):
     needs("clang")
     probe = tmp_path / "probe.c"
     probe.write_text("int LLVMFuzzerTestOneInput(const char *d, unsigned long n) { return d && n > 9; }")
@@ -50,13 +50,13 @@ def test_fuzzer_finds_no_fault(tmp_path: Path) -> None:
     assert int(executed[1]) >= 6_000
 
 
-def test_lint() -> None:
+def test_lint():
     needs("cppcheck")
     done = make(Path("unused"), "lint")
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_arm_images_build_without_warnings(tmp_path: Path) -> None:
+def test_arm_images_build_without_warnings(tmp_path):
     needs("arm-none-eabi-gcc", "arm-none-eabi-nm")
     done = make(tmp_path, "stm32")
     assert (done.returncode, done.stderr) == (0, "")
@@ -71,7 +71,7 @@ def test_arm_images_build_without_warnings(tmp_path: Path) -> None:
     assert not re.search(r" [Tt] (malloc|printf|free)$", names, re.M)
 
 
-def test_core_calls_only_the_hal(tmp_path: Path) -> None:
+def test_core_calls_only_the_hal(tmp_path):
     core = sorted((build.FIRMWARE / "core").glob("*.c"))
     assert len(core) >= 6
     for source in core:

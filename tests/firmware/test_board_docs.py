@@ -12,19 +12,19 @@ from firmware_host.board.fleet import read_inventory
 PAGE = (Path(__file__).parents[2] / "docs" / "transmitter.md").read_text()
 
 
-def blocks(language: str) -> list[str]:
+def blocks(language):
     return re.findall(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.parametrize("block", blocks("console"), ids=["tx", "messages", "changing", "board", "others"])
-def test_commands_run(evlcp, block: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_run(evlcp, block, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for line in block.splitlines():
         done = evlcp(*line.removeprefix("$ evlcp ").split())
         assert (done.code, done.err) == (0, ""), line
 
 
-def test_inventory_is_valid(tmp_path: Path) -> None:
+def test_inventory_is_valid(tmp_path):
     pytest.importorskip("cryptography", reason="the extra sign is not installed")
     from evlcp_sdk.air.signing import make_key
 
@@ -46,11 +46,11 @@ def test_inventory_is_valid(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("block", blocks("python"))
-def test_code_runs(block: str) -> None:
+def test_code_runs(block):
     exec(compile(block, "docs/transmitter.md", "exec"), {})
 
 
-def test_the_delays_of_streams_are_the_benchmarks() -> None:
+def test_the_delays_of_streams_are_the_benchmarks():
     """One row of the table measured again; the others are of the same function."""
     from benchmarks.board import measure_stream
 
@@ -60,17 +60,17 @@ def test_the_delays_of_streams_are_the_benchmarks() -> None:
     assert float(row[1]) == pytest.approx(m.delays_ms.max(), abs=0.2)
 
 
-def test_file_of_symbols_is_one(evlcp, tmp_path: Path) -> None:
+def test_file_of_symbols_is_one(evlcp, tmp_path):
     (tmp_path / "s.json").write_text(blocks("json")[0])
     assert evlcp("tx", "frames", tmp_path / "s.json").code == 0
 
 
-def test_every_command_and_every_key_of_an_inventory_is_told() -> None:
+def test_every_command_and_every_key_of_an_inventory_is_told():
     from firmware_host.board.fleet import Entry
     from firmware_host.commands.board import app
 
     table = PAGE.split("| command | does |")[1].split("\n\n")[0]
-    names = [command.name or command.callback.__name__ for command in app.registered_commands]  # type: ignore[union-attr]
+    names = [command.name or command.callback.__name__ for command in app.registered_commands]
     assert [name for name in names if f"`{name}" not in table] == []
     section = PAGE.split("## Many boards")[1].split("## Emulated")[0]
     assert [field.name for field in fields(Entry) if field.name not in section] == []

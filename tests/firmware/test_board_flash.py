@@ -21,11 +21,11 @@ from firmware_host.ports.rom import SECTORS, RomLoader, flash_image
 from tests.models.rom import RomEmulator, RomLine
 
 
-def some(count: int, seed: int = 0, address: int = FLASH_START) -> FlashImage:
+def some(count, seed=0, address=FLASH_START):
     return FlashImage(address, np.random.default_rng(seed).integers(0, 256, count, np.uint8).tobytes())
 
 
-def test_files_hold_one_image(evlcp, tmp_path: Path) -> None:
+def test_files_hold_one_image(evlcp, tmp_path):
     needs("arm-none-eabi-gcc", "arm-none-eabi-objcopy")
     for target in build.TARGETS:
         done = well(evlcp("board", "build", "--target", target, "-o", tmp_path / "new", "--json"))
@@ -51,16 +51,16 @@ def test_files_hold_one_image(evlcp, tmp_path: Path) -> None:
         ("a.elf", b"\x7fELF\x02\x01" + bytes(60), "not one of 32 bits"),
     ],
 )
-def test_damaged_images_are_told(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+def test_damaged_images_are_told(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=message):
         FlashImage.read(tmp_path / name)
 
 
-def test_flashed_read_back_started_and_the_rest_left_alone() -> None:
+def test_flashed_read_back_started_and_the_rest_left_alone():
     old, end = some(1 << 20, 1).data, sum(SECTORS[:5])
     rom, new = RomEmulator(old), some(70_001, 2)
-    told: list[tuple[int, int]] = []
+    told = []
     loader = RomLoader(RomLine(rom))
     sectors = flash_image(loader, new, progress=lambda done, total: told.append((done, total)))
     assert sectors == rom.erased == [0, 1, 2, 3, 4]
@@ -77,18 +77,18 @@ def test_flashed_read_back_started_and_the_rest_left_alone() -> None:
 class BadLine(RomLine):
     """Loses a byte or turns a bit, now and then."""
 
-    def __init__(self, rom: RomEmulator, seed: int, one_in: int) -> None:
+    def __init__(self, rom, seed, one_in):
         super().__init__(rom)
         self._rng, self._one_in = np.random.default_rng(seed), one_in
 
-    def to_part(self, data: bytes) -> bytes:
+    def to_part(self, data):
         dice = self._rng.integers(0, 2 * self._one_in, len(data))
         return bytes(byte ^ (0x10 if n == 1 else 0) for byte, n in zip(data, dice, strict=True) if n)
 
     to_host = to_part
 
 
-def test_a_bad_line_gets_through_or_is_told() -> None:
+def test_a_bad_line_gets_through_or_is_told():
     through = 0
     for seed in range(12):
         rom, new = RomEmulator(), some(6_000, seed)
@@ -103,11 +103,11 @@ def test_a_bad_line_gets_through_or_is_told() -> None:
 class Cut(RomLine):
     """Ends after so many bytes."""
 
-    def __init__(self, rom: RomEmulator, left: int) -> None:
+    def __init__(self, rom, left):
         super().__init__(rom)
         self.left = left
 
-    def to_part(self, data: bytes) -> bytes:
+    def to_part(self, data):
         self.left -= len(data)
         return data if self.left > 0 else b""
 
@@ -115,13 +115,13 @@ class Cut(RomLine):
 class Worn(RomEmulator):
     """Has a bit that stays."""
 
-    def _write(self, address: int):
+    def _write(self, address):
         good = yield from super()._write(address)
         self.flash[77] |= 1
         return good
 
 
-def test_what_cannot_be_flashed_is_told() -> None:
+def test_what_cannot_be_flashed_is_told():
     with pytest.raises(NoBoardError, match="set BOOT0 high, press reset"):
         RomLoader(Cut(RomEmulator(), 0))
     rom = Worn()
@@ -141,7 +141,7 @@ def test_what_cannot_be_flashed_is_told() -> None:
     assert rom.flash[:6_000] == some(6_000).data
 
 
-def test_brown_out_is_set_and_nothing_else() -> None:
+def test_brown_out_is_set_and_nothing_else():
     rom = RomEmulator()
     before = bytes(rom.options)
     loader = RomLoader(RomLine(rom))
@@ -152,7 +152,7 @@ def test_brown_out_is_set_and_nothing_else() -> None:
     assert rom.options == bytes([before[0] & 0xF3]) + before[1:]
 
 
-def test_what_the_command_flashes_boots_where_it_was_flashed(evlcp, tmp_path: Path) -> None:
+def test_what_the_command_flashes_boots_where_it_was_flashed(evlcp, tmp_path):
     needs("arm-none-eabi-gcc")
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
     port, kept = f"unix:{tmp_path / 'part'}", tmp_path / "flash.bin"
@@ -182,7 +182,7 @@ def test_what_the_command_flashes_boots_where_it_was_flashed(evlcp, tmp_path: Pa
     )
 
 
-def test_the_image_for_another_crystal_boots_by_that_one(stm32) -> None:
+def test_the_image_for_another_crystal_boots_by_that_one(stm32):
     rom = RomEmulator(some(1 << 20, 5).data)
     flash_image(RomLoader(RomLine(rom)), FlashImage.read(build.arm_image("stm32f405-12mhz")))
     flash = FlashImage(FLASH_START, bytes(rom.flash))
@@ -193,7 +193,7 @@ def test_the_image_for_another_crystal_boots_by_that_one(stm32) -> None:
             stm32(wrong, hse_hz)
 
 
-def test_a_part_without_brown_out_is_told(evlcp, tmp_path: Path) -> None:
+def test_a_part_without_brown_out_is_told(evlcp, tmp_path):
     (tmp_path / "image.bin").write_bytes(some(1_000).data)
     for said, options in ((True, ()), (False, ("--brown-out",))):
         rom = RomEmulator()
@@ -208,7 +208,7 @@ def test_a_part_without_brown_out_is_told(evlcp, tmp_path: Path) -> None:
         assert rom.resets == (not said)
 
 
-def serve(rom: RomEmulator, server: socket.socket) -> None:
+def serve(rom, server):
     """A ROM at a port, for one host."""
     with server.accept()[0] as line:
         while data := line.recv(4096):

@@ -1,10 +1,7 @@
 """Fleets: one inventory, many boards, some of which fail."""
 
 import json
-from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
-from typing import Any
 
 import pytest
 from board_lines import SITE, Native, check_fault, options_of, well
@@ -17,7 +14,7 @@ GOOD = BOARD + "random = 1\n"
 
 
 @pytest.fixture
-def boards(tmp_path: Path) -> Iterator[list[Native]]:
+def boards(tmp_path):
     """Native boards on unix sockets."""
     with ExitStack() as stack:
         emulated = [Native(f"unix:{tmp_path / f'b{n}'}", unique_id=n) for n in range(4)]
@@ -26,7 +23,7 @@ def boards(tmp_path: Path) -> Iterator[list[Native]]:
         yield emulated
 
 
-def inventory(path: Path, ports: list[str], extra: dict[int, str]) -> Path:
+def inventory(path, ports, extra):
     tables = ["[defaults]\nrandom = 16"]
     for n, port in enumerate(ports):
         line = f'[[board]]\nid = "T{n:02}"\nport = "{port}"\nposition_m = [0.0, {n}.5, 5]\nseed = {n}\n'
@@ -35,7 +32,7 @@ def inventory(path: Path, ports: list[str], extra: dict[int, str]) -> Path:
     return path
 
 
-def test_a_boards_link(tmp_path: Path) -> None:
+def test_a_boards_link(tmp_path):
     (tmp_path / "links").mkdir()
     (tmp_path / "links" / "fast.toml").write_text("[air]\nchip_rate_hz = 20000.0\n")
     extra = {1: "link = {air = {pilot_every = 4, frames_per_packet = 8}}\n", 2: 'link = "links/fast.toml"\n'}
@@ -51,7 +48,7 @@ def test_a_boards_link(tmp_path: Path) -> None:
     assert [bank.codebook.profile for bank in read_inventory(file).banks.values()] == ["wh8", "wh4x2"]
 
 
-def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
+def test_a_payload_has_its_own_link(evlcp, tmp_path):
     options = options_of("modulation.id=wh8", "air.chip_rate_hz=5000.0")
     well(evlcp("tx", "message", "--text", "a", "-o", tmp_path / "m.json", *options))
     file = tmp_path / "one.toml"
@@ -64,7 +61,7 @@ def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
         read_inventory(file)
 
 
-def test_two_of_four(evlcp, boards: list[Native], tmp_path: Path) -> None:
+def test_two_of_four(evlcp, boards, tmp_path):
     # one port has nobody, one board cannot take the level
     ports = [board.line.place for board in boards]
     file = tmp_path / "tunnel.toml"
@@ -89,7 +86,7 @@ def test_two_of_four(evlcp, boards: list[Native], tmp_path: Path) -> None:
     assert rows[0]["position_m"][0] == 0.0
 
 
-def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards: list[Native], tmp_path: Path) -> None:
+def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards, tmp_path):
     (tmp_path / "site.toml").write_text(SITE)
     file = tmp_path / "tunnel.toml"
     text = '[defaults]\nsequence = 4\nbeacon = "site.toml"\nuser = "north"\ntext = "Tempo 30"\n'
@@ -97,7 +94,7 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards: list[Nativ
         text += f'[[board]]\nid = "T{n}"\nport = "{one.line.place}"\nposition_m = [0, 0, {n}]\n'
     file.write_text(text)
 
-    def rows(*arguments: object) -> list[dict[str, Any]]:
+    def rows(*arguments):
         done = well(evlcp("board", *arguments, "--inventory", file, "--json"))
         return sorted(map(json.loads, done.out.splitlines()), key=lambda row: row["id"])
 
@@ -127,7 +124,7 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards: list[Nativ
     check_fault(refused, 2, "write --port there")
 
 
-def test_the_packets_of_an_inventory_are_those_of_tx_message(evlcp, tmp_path: Path) -> None:
+def test_the_packets_of_an_inventory_are_those_of_tx_message(evlcp, tmp_path):
     pytest.importorskip("cryptography", reason="the extra sign is not installed")
     (tmp_path / "site.toml").write_text(SITE)
     well(evlcp("tx", "keygen", tmp_path / "private.pem"))
@@ -165,7 +162,7 @@ def test_the_packets_of_an_inventory_are_those_of_tx_message(evlcp, tmp_path: Pa
         (BOARD + 'beacon = "site.toml"\nkey = "no.pem"\nsequence = 1', 3, "no.pem: cannot be read"),
     ],
 )
-def test_wrong_inventory_is_one_line(evlcp, tmp_path: Path, text: str, code: int, expected: str) -> None:
+def test_wrong_inventory_is_one_line(evlcp, tmp_path, text, code, expected):
     (tmp_path / "site.toml").write_text(SITE)
     file = tmp_path / "tunnel.toml"
     file.write_text(text)
@@ -174,7 +171,7 @@ def test_wrong_inventory_is_one_line(evlcp, tmp_path: Path, text: str, code: int
     assert done.out == ""
 
 
-def test_another_board_on_the_port_is_refused(evlcp, tmp_path: Path) -> None:
+def test_another_board_on_the_port_is_refused(evlcp, tmp_path):
     file = tmp_path / "tunnel.toml"
     file.write_text(GOOD + f'unique_id = "{"0" * 23}7"\n')
     done = evlcp("board", "program", "--inventory", file)

@@ -6,8 +6,7 @@ import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -19,7 +18,7 @@ from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.monitor import Back, Gone, watch
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
-from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.emulators.simulated import SimulatedLine
 from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
 from firmware_host.ports.transport import ReplayTransport, SocketTransport, TraceTransport
 from firmware_host.protocol.client import Timing
@@ -27,7 +26,7 @@ from firmware_host.protocol.generated.requests import BoardFault, State, Status,
 from tests.models.usb import UsbLine
 
 
-def test_a_host_that_stays_keeps_the_watchdog_still(device: SimulatedBoard, board: Board) -> None:
+def test_a_host_that_stays_keeps_the_watchdog_still(device, board):
     done = provision(board, some_bank(2), Settings(watchdog=Watchdog.IDLE, watchdog_ms=300))
     assert (done.watchdog, done.watchdog_ms) == ("idle", 300)
     status = board.status()
@@ -48,14 +47,14 @@ def test_a_host_that_stays_keeps_the_watchdog_still(device: SimulatedBoard, boar
     assert board.status().requests == before.requests + 1
 
 
-def within(seconds: float, done: Callable[[], bool]) -> bool:
+def within(seconds, done):
     end = time.monotonic() + seconds
     while not done() and time.monotonic() < end:
         time.sleep(0.01)
     return done()
 
 
-def interrupted(command: list[str], begun: Callable[[], bool]) -> str:
+def interrupted(command, begun):
     """What a command says that is ended with Ctrl-C once it has begun; it ends well."""
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert within(60, begun)
@@ -65,10 +64,10 @@ def interrupted(command: list[str], begun: Callable[[], bool]) -> str:
     return out
 
 
-def test_program_keeps_alive_until_it_is_ended(evlcp, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_program_keeps_alive_until_it_is_ended(evlcp, monkeypatch):
     stays = iter([Board.start, Board.blank])
 
-    def stay(board: Board, seconds: float, status: StatusReply) -> None:
+    def stay(board, seconds, status):
         if (does := next(stays, None)) is None:
             raise KeyboardInterrupt
         does(board)
@@ -78,7 +77,7 @@ def test_program_keeps_alive_until_it_is_ended(evlcp, monkeypatch: pytest.Monkey
     assert done.err == "evlcp: native:: state dark, faults none\n"
 
 
-def has_sent(leds: Path) -> bool:
+def has_sent(leds):
     """Whether a packet has begun: no two chips of the idle pattern are alike."""
     if leds.stat().st_size < 4_000:
         return False
@@ -86,7 +85,7 @@ def has_sent(leds: Path) -> bool:
     return bool((rows[1:] == rows[:-1]).all(1).any())
 
 
-def test_ctrl_c_ends_the_stream_of_a_message(evlcp, native: str, tmp_path: Path) -> None:
+def test_ctrl_c_ends_the_stream_of_a_message(evlcp, native, tmp_path):
     command = [*EVLCP, "tx", "message", "--text", "{n}", "--every", "60", "--port", native, "--json"]
     told = json.loads(interrupted(command, lambda: has_sent(tmp_path / "leds.bin")))
     status = json.loads(evlcp("board", "--port", native, "status", "--json").out)
@@ -94,7 +93,7 @@ def test_ctrl_c_ends_the_stream_of_a_message(evlcp, native: str, tmp_path: Path)
     check_fault(evlcp("board", "--port", native, "start"), 5, "NOTHING_COMMITTED")
 
 
-def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp, native: str) -> None:
+def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp, native):
     board = ("board", "--port", native)
     well(evlcp(*board, "program", "--random", 1, "--no-start"))
     done = evlcp(*board, "start", "--pulse-hz", 2)
@@ -114,7 +113,7 @@ def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp
 
 
 @pytest.mark.parametrize(("latency_s", "frame_s", "at_most"), [(0.0, 0.0, 1.15), (0.002, 0.001, 1.3)])
-def test_programming_takes_the_wire_time(device, latency_s, frame_s, at_most) -> None:
+def test_programming_takes_the_wire_time(device, latency_s, frame_s, at_most):
     """By the board's own clock, over a line alone and behind a USB bridge: few waits for answers."""
     baud = 1_000_000
     board = board_on(UsbLine(device, latency_s, baud, frame_s))
@@ -125,7 +124,7 @@ def test_programming_takes_the_wire_time(device, latency_s, frame_s, at_most) ->
     assert wire_us < device.now_us - began_us <= at_most * wire_us
 
 
-def test_another_rate_while_it_plays_is_refused_before_anything_is_sent(device: SimulatedBoard) -> None:
+def test_another_rate_while_it_plays_is_refused_before_anything_is_sent(device):
     line = recording(device)
     board = board_on(line)
     provision(board, some_bank(2), Settings())
@@ -141,7 +140,7 @@ def test_another_rate_while_it_plays_is_refused_before_anything_is_sent(device: 
     assert provision(board, fast, Settings()).swapped
 
 
-def test_a_bank_that_does_not_hold_is_told(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bank_that_does_not_hold_is_told(board, monkeypatch):
     crc = board.crc
     monkeypatch.setattr(board, "crc", lambda *place: crc(*place) ^ 1)
     with pytest.raises(VerifyError, match="does not hold what was sent") as told:
@@ -149,7 +148,7 @@ def test_a_bank_that_does_not_hold_is_told(board: Board, monkeypatch: pytest.Mon
     assert "baud" not in str(told.value)
 
 
-def test_a_second_host_learns_of_the_first(evlcp, native: str) -> None:
+def test_a_second_host_learns_of_the_first(evlcp, native):
     with Session(SocketTransport.connect(native)) as session:
         first = Board(session)
         second = evlcp("board", "hello", "--port", native)
@@ -162,7 +161,7 @@ def test_a_second_host_learns_of_the_first(evlcp, native: str) -> None:
             Board(session).status()
 
 
-def test_a_socket_that_stays_silent_or_hangs_up_is_not_told_to_look_at_power() -> None:
+def test_a_socket_that_stays_silent_or_hangs_up_is_not_told_to_look_at_power():
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = f"tcp:127.0.0.1:{server.getsockname()[1]}"
         for hangs_up, says in (
@@ -179,18 +178,18 @@ def test_a_socket_that_stays_silent_or_hangs_up_is_not_told_to_look_at_power() -
                 line.close()
 
 
-def test_a_monitor_finds_its_board_again(device: SimulatedBoard) -> None:
+def test_a_monitor_finds_its_board_again(device):
     """A line that breaks, a board that is off for a while, and one that was reset."""
 
-    def breaks(_: object) -> None:
+    def breaks(_):
         raise LineError("x: the line broke")
 
-    def off() -> Board:
+    def off():
         raise NoBoardError("x: it is not there")
 
     lines = iter([lambda: board_on(FatalLine(device, 50, breaks)), off, *[lambda: board_on(device)] * 2])
 
-    def opened() -> AbstractContextManager[Board]:
+    def opened():
         return nullcontext(next(lines)())
 
     seen = []
@@ -206,11 +205,11 @@ def test_a_monitor_finds_its_board_again(device: SimulatedBoard) -> None:
     assert seen[3].after_s >= 0.5
     assert not list(lines)
     with pytest.raises(NoBoardError):
-        list(watch(off, 0.01, count=1))  # type: ignore[arg-type]
+        list(watch(off, 0.01, count=1))
 
 
-def test_a_trace_follows_no_link_and_outlasts_its_host(device: SimulatedBoard, tmp_path: Path) -> None:
-    def traced(path: Path) -> TraceTransport:
+def test_a_trace_follows_no_link_and_outlasts_its_host(device, tmp_path):
+    def traced(path):
         return TraceTransport(SimulatedLine(device), path, 9600, 1, 2)
 
     trace = traced(tmp_path / "wire.jsonl")
@@ -226,7 +225,7 @@ def test_a_trace_follows_no_link_and_outlasts_its_host(device: SimulatedBoard, t
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_a_full_disk_ends_a_trace_in_one_line(device: SimulatedBoard) -> None:
+def test_a_full_disk_ends_a_trace_in_one_line(device):
     trace = TraceTransport(SimulatedLine(device), Path("/dev/full"), 9600, 1, 2)
     for end in (lambda: trace.write(bytes(100_000)), trace.close):
         with pytest.raises(OutputError, match="/dev/full: cannot be written: No space left"):

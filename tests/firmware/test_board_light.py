@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 from board_lines import LINK, board_on, some_bank, state_of
 from hypothesis import given, settings, strategies as st
-from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from firmware_host.board.bank import Bank
-from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.board import Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import RefusedError
 from firmware_host.protocol.generated.requests import BoardFault, State, Status
@@ -20,11 +19,11 @@ CHIPS = 26 + 32 * FRAMES
 GOOD = some_bank(2)
 
 
-def bank_of_rows(rows: NDArray[np.uint8]) -> Bank:
+def bank_of_rows(rows):
     return Bank.of_chips(rows, LINK.codebook, PacketFormat.of(LINK.codebook, FRAMES))
 
 
-def limits(board: Board) -> tuple[int, int, int]:
+def limits(board):
     """The current, its limit and the duty's."""
     status = board.status()
     return status.level_ma, status.level_limit_ma, status.duty_limit
@@ -33,13 +32,13 @@ def limits(board: Board) -> tuple[int, int, int]:
 ONES = bank_of_rows(np.ones((CHIPS, 96), np.uint8))
 
 
-def excess(rows: NDArray[np.uint8], duty: float) -> NDArray[np.float64]:
+def excess(rows, duty):
     """The chips that a LED is on beyond its share, the worst LED's and stretch's that ends with each chip."""
     sums = np.vstack([np.zeros((1, 96)), np.cumsum(rows - duty, axis=0)])
     return (sums - np.minimum.accumulate(sums, axis=0)).max(1)[1:]
 
 
-def test_all_ones_at_full_current_are_refused(device: SimulatedBoard, board: Board) -> None:
+def test_all_ones_at_full_current_are_refused(device, board):
     assert (board.about.level_max_ma, board.about.mean_max_ma, board.about.burst_chips) == (60, 30, BURST)
     provision(board, GOOD, Settings(level_ma=60))
     assert board.status().duty == 500
@@ -61,7 +60,7 @@ def test_all_ones_at_full_current_are_refused(device: SimulatedBoard, board: Boa
     assert board.status().level_ma == 60
 
 
-def test_limits_hold_at_once_and_outlive_a_reset_by_save(device: SimulatedBoard, board: Board) -> None:
+def test_limits_hold_at_once_and_outlive_a_reset_by_save(device, board):
     provision(board, GOOD, Settings(level_ma=40, start=False))
     board.limit(GOOD, level_ma=25, duty=0.5)
     assert limits(board) == (25, 25, 500)
@@ -87,7 +86,7 @@ def test_limits_hold_at_once_and_outlive_a_reset_by_save(device: SimulatedBoard,
         Settings(duty_limit=0)
 
 
-def test_a_duty_limit_fits_what_is_programmed_with_it(device: SimulatedBoard, board: Board) -> None:
+def test_a_duty_limit_fits_what_is_programmed_with_it(device, board):
     rows = np.zeros((CHIPS, 96), np.uint8)
     rows[::5] = 1
     dim = bank_of_rows(rows)
@@ -117,7 +116,7 @@ def test_a_duty_limit_fits_what_is_programmed_with_it(device: SimulatedBoard, bo
 
 
 @st.composite
-def streams(draw: st.DrawFn) -> tuple[NDArray[np.uint8], int, float]:
+def streams(draw):
     """Chips of which some LEDs are on in runs, a current, and a limit of duty."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     share, run = draw(st.floats(0.05, 1.0)), draw(st.integers(1, 2 * CHIPS))
@@ -131,7 +130,7 @@ def streams(draw: st.DrawFn) -> tuple[NDArray[np.uint8], int, float]:
 
 @settings(max_examples=60, deadline=None)
 @given(streams(), st.lists(st.integers(1, 2000), max_size=4))
-def test_no_stretch_of_what_is_sent_is_beyond_the_limits(stream, stops) -> None:
+def test_no_stretch_of_what_is_sent_is_beyond_the_limits(stream, stops):
     rows, level_ma, limit = stream
     device = SimulatedBoard()
     board = board_on(device)
@@ -171,7 +170,7 @@ def test_no_stretch_of_what_is_sent_is_beyond_the_limits(stream, stops) -> None:
     assert not len(everything) or excess(everything, duty).max() <= BURST + 10 * (len(stops) > 0)
 
 
-def test_the_led_test_keeps_to_the_mean_current(device: SimulatedBoard, board: Board) -> None:
+def test_the_led_test_keeps_to_the_mean_current(device, board):
     board.level(60)
     board.test_leds(3, 4, 50)
     assert (device.bench.level_ma, board.status().level_ma) == (30, 60)

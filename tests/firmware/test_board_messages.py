@@ -14,20 +14,19 @@ from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message, joined
 from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.air.kinds import CountdownKind, TimeKind
-from evlcp_sdk.link.resolve import Link
 from firmware_host.emulators.led_record import RECORD, LedRecord
 
 TILTED = f"{SITE}heading_deg = 90.0\ntilt_deg = 1.5\n"
 
 
 @pytest.fixture
-def site(tmp_path: Path) -> Path:
+def site(tmp_path):
     path = tmp_path / "site.toml"
     path.write_text(TILTED)
     return path
 
 
-def symbols_of(chips: np.ndarray, link: Link = LINK) -> np.ndarray:
+def symbols_of(chips, link=LINK):
     """Symbols (packets, frames, clusters) of chips that begin with a packet."""
     packet, words = link.packet, link.codebook.codewords
     whole = chips[: len(chips) // packet.packet_chips * packet.packet_chips]
@@ -37,10 +36,10 @@ def symbols_of(chips: np.ndarray, link: Link = LINK) -> np.ndarray:
     return (segments[:, :, :, None] == words).all(4).argmax(3)
 
 
-def messages_of(symbols: np.ndarray, link: Link = LINK) -> dict[Kind, Message]:
+def messages_of(symbols, link=LINK):
     """The messages that packets carry, each whole, by kind."""
     coder = link.block_coder()
-    parts: dict[Kind, dict[int, Block]] = {}
+    parts = {}
     for packet in symbols:
         bits = bits_of_symbols(packet, link.codebook.bits_per_symbol)
         content = coder.block((4 - 8.0 * bits).astype(np.float32))
@@ -55,12 +54,12 @@ def messages_of(symbols: np.ndarray, link: Link = LINK) -> dict[Kind, Message]:
     return found
 
 
-def packets_on(leds: Path) -> np.ndarray:
+def packets_on(leds):
     """Symbols of the packets that a board showed; what is between them is left out."""
     return symbols_of(np.concatenate(packets_shown(LedRecord.read(leds).played().chips())[0]))
 
 
-def test_a_text_a_file_and_a_beacon(evlcp, site: Path, tmp_path: Path) -> None:
+def test_a_text_a_file_and_a_beacon(evlcp, site, tmp_path):
     data, out, chips = tmp_path / "data.bin", tmp_path / "m.json", tmp_path / "c.npy"
     data.write_bytes(bytes(range(100)))
     sent = ("--text", "Tempo 30 für 2 km", "--file", data, "--beacon", site, "--user", "lane 2")
@@ -98,14 +97,14 @@ def test_a_text_a_file_and_a_beacon(evlcp, site: Path, tmp_path: Path) -> None:
         (("--text", "a" * 8000, "--every", "1", "--port", "native:"), 2, "201 packets of 34.6 ms; give"),
     ],
 )
-def test_faults_are_one_line(evlcp, tmp_path, monkeypatch, options, code, says) -> None:
+def test_faults_are_one_line(evlcp, tmp_path, monkeypatch, options, code, says):
     monkeypatch.chdir(tmp_path)
     Path("two.toml").write_text(TILTED + TILTED.replace("= 7", "= 8"))
     check_fault(evlcp("tx", "message", *options), code, says)
     well(evlcp("tx", "message", "--beacon", "two.toml", "--id", 8, "--json"))
 
 
-def test_what_tx_wrote_tx_shows(evlcp, tmp_path: Path) -> None:
+def test_what_tx_wrote_tx_shows(evlcp, tmp_path):
     out, chips, again = tmp_path / "m.json", tmp_path / "c.npy", tmp_path / "again.npy"
     (tmp_path / "link.toml").write_text('[pilots]\nid = "barker13"\n')
     options = ("--set", "pilots.id=barker13")
@@ -130,7 +129,7 @@ def test_what_tx_wrote_tx_shows(evlcp, tmp_path: Path) -> None:
         ("error-correction.id=reed-solomon", "error-correction.id: sent with"),
     ],
 )
-def test_another_link_is_refused_and_says_where(evlcp, tmp_path: Path, other: str, differ: str) -> None:
+def test_another_link_is_refused_and_says_where(evlcp, tmp_path, other, differ):
     out = tmp_path / "m.json"
     well(evlcp("tx", "message", "--text", "hi", "-o", out, "--set", "pilots.id=barker13"))
     done = evlcp("tx", "frames", out, "--set", "pilots.id=barker13", "--set", other)
@@ -138,7 +137,7 @@ def test_another_link_is_refused_and_says_where(evlcp, tmp_path: Path, other: st
     assert done.out == ""
 
 
-def test_without_an_output_nothing_is_sent(evlcp, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_an_output_nothing_is_sent(evlcp, monkeypatch, tmp_path):
     done = evlcp("tx", "message", "--text", "hi")
     says = "evlcp: nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips\n"
     check_fault(done, 2, says)
@@ -152,7 +151,7 @@ def test_without_an_output_nothing_is_sent(evlcp, monkeypatch: pytest.MonkeyPatc
     well(evlcp("tx", "message", "--text", "hi", "-o", tmp_path / "m.json"))
 
 
-def test_a_board_plays_it(evlcp, native: str, site: Path, tmp_path: Path) -> None:
+def test_a_board_plays_it(evlcp, native, site, tmp_path):
     text = "Tempo 30 " * 20
     done = well(evlcp("tx", "message", "--text", text, "--beacon", site, "--sequence", 3, "--port", native))
     *_, again, sent = done.out.splitlines()
@@ -172,7 +171,7 @@ def test_a_board_plays_it(evlcp, native: str, site: Path, tmp_path: Path) -> Non
 # -- streams
 
 
-def test_texts_go_out_as_they_come(native: str, tmp_path: Path) -> None:
+def test_texts_go_out_as_they_come(native, tmp_path):
     leds = tmp_path / "leds.bin"
     command = [*EVLCP, "board", "stream", "--port", native, "--id", "7", "--json"]
     pipe = subprocess.PIPE
@@ -194,7 +193,7 @@ def test_texts_go_out_as_they_come(native: str, tmp_path: Path) -> None:
     assert done["underruns"] in (2, 3)
 
 
-def test_symbols_from_a_file(evlcp, native: str, tmp_path: Path) -> None:
+def test_symbols_from_a_file(evlcp, native, tmp_path):
     table = json.loads(evlcp("tx", "frames", "--random", 4, "--seed", 5, "--format", "json").out)["symbols"]
     file = tmp_path / "lines.jsonl"
     # a packet a line, then two on one
@@ -216,13 +215,13 @@ def test_symbols_from_a_file(evlcp, native: str, tmp_path: Path) -> None:
         (b"\xff", (), "cannot be read"),
     ],
 )
-def test_a_wrong_line_is_told(evlcp, tmp_path, text, options, says) -> None:
+def test_a_wrong_line_is_told(evlcp, tmp_path, text, options, says):
     file = tmp_path / "lines"
     file.write_bytes(text)
     check_fault(evlcp("board", "stream", file, "--port", "native:", *options), 3, says)
 
 
-def test_a_message_that_changes(evlcp, native: str, tmp_path: Path) -> None:
+def test_a_message_that_changes(evlcp, native, tmp_path):
     began = time.time()
     said = ("--text", "{n}: {left} s left at {time}", "--time", "--countdown", 100, "--sequence", 40)
     done = evlcp(

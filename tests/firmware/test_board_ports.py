@@ -6,7 +6,6 @@ import os
 import pty
 import termios
 import tty
-from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from unittest.mock import Mock, PropertyMock
 
@@ -23,15 +22,13 @@ serial = pytest.importorskip("serial")
 Fault = serial.SerialException
 
 
-def listed(
-    device: str, vid: int | None = None, pid: int | None = None, number: str | None = None
-) -> SimpleNamespace:
+def listed(device, vid=None, pid=None, number=None):
     """A port as pyserial lists it."""
     return SimpleNamespace(device=device, description=f"{device} n/a", vid=vid, pid=pid, serial_number=number)
 
 
 @pytest.fixture
-def pty_name() -> Iterator[tuple[int, str]]:
+def pty_name():
     """A pseudo-terminal: our end, and the name of the other, a port."""
     ours, other = pty.openpty()
     tty.setraw(other)
@@ -41,19 +38,19 @@ def pty_name() -> Iterator[tuple[int, str]]:
 
 
 @pytest.fixture
-def ports(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
+def ports(monkeypatch):
     found = [listed("COM7", 0x0403, 0x6015, "D30A1"), listed("COM3"), listed("COM9", 0x1546, 0x01A9, "gps")]
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: found)
     return found
 
 
 @pytest.fixture
-def opened(monkeypatch: pytest.MonkeyPatch) -> Callable[[], list[str]]:
+def opened(monkeypatch):
     """Which ports were opened since the last look; none can be."""
     refuse = Mock(side_effect=Fault(errno.ENOENT, "could not open port"))
     monkeypatch.setattr("serial.serial_for_url", refuse)
 
-    def names() -> list[str]:
+    def names():
         found = sorted(call.args[0] for call in refuse.call_args_list)
         refuse.reset_mock()
         return found
@@ -71,7 +68,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> Callable[[], list[str]]:
         ("0403:6001", []),
     ],
 )
-def test_ports_by_usb_id(ports: list[SimpleNamespace], text: str, takes: list[str]) -> None:
+def test_ports_by_usb_id(ports, text, takes):
     wanted = UsbFilter.parse(text)
     assert [p.device for p in serial_ports() if wanted.takes(p)] == takes
     if takes:
@@ -81,7 +78,7 @@ def test_ports_by_usb_id(ports: list[SimpleNamespace], text: str, takes: list[st
             device_of(text)
 
 
-def test_a_usb_id_must_be_one(ports: list[SimpleNamespace], opened: Callable[[], list[str]]) -> None:
+def test_a_usb_id_must_be_one(ports, opened):
     for wrong in ("", "403", "0403-6015", "xyz0", "0403:"):
         with pytest.raises(ConfigError, match="expected VID, VID:PID or VID:PID:SERIAL"):
             UsbFilter.parse(wrong)
@@ -93,7 +90,7 @@ def test_a_usb_id_must_be_one(ports: list[SimpleNamespace], opened: Callable[[],
     assert opened() == ["COM7"]
 
 
-def test_board_ports(evlcp, ports: list[SimpleNamespace], opened: Callable[[], list[str]]) -> None:
+def test_board_ports(evlcp, ports, opened):
     rows = json.loads(evlcp("board", "ports", "--json").out)
     assert [(r["port"], r["usb"], r["asked"]) for r in rows] == [
         ("COM3", None, False),
@@ -108,7 +105,7 @@ def test_board_ports(evlcp, ports: list[SimpleNamespace], opened: Callable[[], l
     check_fault(evlcp("board", "ports", "--usb", "no"), 2, "expected VID, VID:PID or VID:PID:SERIAL")
 
 
-def test_a_real_tty_gets_no_byte(monkeypatch: pytest.MonkeyPatch, evlcp, pty_name: tuple[int, str]) -> None:
+def test_a_real_tty_gets_no_byte(monkeypatch, evlcp, pty_name):
     """What hangs on a port of no bridge hears nothing of the search."""
     ours, port = pty_name
     os.set_blocking(ours, False)
@@ -130,13 +127,13 @@ def test_a_real_tty_gets_no_byte(monkeypatch: pytest.MonkeyPatch, evlcp, pty_nam
         ("hwgrep://[", KeyError("x"), "evlcp board ports"),
     ],
 )
-def test_what_cannot_be_opened_says_what_to_do(evlcp, monkeypatch, port, fault, says) -> None:
+def test_what_cannot_be_opened_says_what_to_do(evlcp, monkeypatch, port, fault, says):
     monkeypatch.setattr("serial.serial_for_url", Mock(side_effect=fault))
     done = evlcp("board", "hello", "--port", port, "--baud", "3000000")
     check_fault(done, 4, f"{port}: cannot be opened", says)
 
 
-def test_a_port_has_one_host(pty_name: tuple[int, str]) -> None:
+def test_a_port_has_one_host(pty_name):
     line = SerialTransport(pty_name[1], 9600)
     with pytest.raises(NoBoardError, match="another program has it open"):
         SerialTransport(pty_name[1], 9600)
@@ -155,7 +152,7 @@ def test_a_port_has_one_host(pty_name: tuple[int, str]) -> None:
     ],
     ids=lambda fault: type(fault).__name__,
 )
-def test_an_unplugged_port_is_a_broken_line(monkeypatch: pytest.MonkeyPatch, fault: Exception) -> None:
+def test_an_unplugged_port_is_a_broken_line(monkeypatch, fault):
     unplugged = Mock()
     type(unplugged).in_waiting = PropertyMock(side_effect=fault)
     unplugged.write.side_effect = unplugged.close.side_effect = fault
@@ -167,6 +164,6 @@ def test_an_unplugged_port_is_a_broken_line(monkeypatch: pytest.MonkeyPatch, fau
     line.close()
 
 
-def test_no_port(monkeypatch: pytest.MonkeyPatch, evlcp) -> None:
+def test_no_port(monkeypatch, evlcp):
     monkeypatch.setattr("serial.tools.list_ports.comports", list)
     check_fault(evlcp("board", "status"), 4, "--port native: for an emulated one")

@@ -26,11 +26,11 @@ PAYLOADS = [
 ]
 
 
-def definition() -> dict:
+def definition():
     return tomllib.loads((generate.HERE / "protocol" / "protocol.toml").read_text())
 
 
-def test_generated_files_are_fresh(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+def test_generated_files_are_fresh(monkeypatch, capsys):
     assert generate.main(["--check"]) == 0, "run python -m firmware_host.protocol.generate"
     files = generate.generated_files()
     first = next(iter(files))
@@ -39,7 +39,7 @@ def test_generated_files_are_fresh(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     assert first.name in capsys.readouterr().err
 
 
-def test_what_comes_later_stands_at_the_end() -> None:
+def test_what_comes_later_stands_at_the_end():
     table = definition()
     table["message"][1]["request"][0]["since"] = 1
     with pytest.raises(ValueError, match="configure: a field with `since` stands before one without"):
@@ -50,14 +50,14 @@ def test_what_comes_later_stands_at_the_end() -> None:
         generate.render("requests.py", table)
 
 
-def test_types_and_names_are_unique() -> None:
+def test_types_and_names_are_unique():
     table = definition()["message"]
     assert len({m["type"] for m in table}) == len({m["name"] for m in table}) == len(table)
     assert all(m["type"] < messages.REPLY_BIT for m in table)
 
 
 @pytest.mark.parametrize("vector", VECTORS, ids=lambda v: v.name)
-def test_golden_vector(vector) -> None:
+def test_golden_vector(vector):
     d = vector.datagram
     head = bytes([d.type, d.status]) + d.sequence.to_bytes(2, "little") + d.session.to_bytes(2, "little")
     body = head + d.payload
@@ -67,7 +67,7 @@ def test_golden_vector(vector) -> None:
 
 
 @st.composite
-def payloads(draw: st.DrawFn) -> WireMessage:
+def payloads(draw):
     cls = draw(st.sampled_from(PAYLOADS))
     values = []
     hints = get_type_hints(cls, include_extras=True)
@@ -86,12 +86,12 @@ def payloads(draw: st.DrawFn) -> WireMessage:
 
 
 @given(payloads())
-def test_message_round_trip(message: WireMessage) -> None:
+def test_message_round_trip(message):
     assert type(message).unpack(message.pack()) == message
 
 
 @given(payloads(), st.integers(1, 3))
-def test_message_of_another_length_is_refused(message: WireMessage, cut: int) -> None:
+def test_message_of_another_length_is_refused(message, cut):
     data = message.pack()
     cls = type(message)
     if len(data) >= cut and data[:-cut] and len(data) - cut < cls.fixed_bytes():
@@ -102,7 +102,7 @@ def test_message_of_another_length_is_refused(message: WireMessage, cut: int) ->
         assert cls.unpack(data + b"x" * cut) == message
 
 
-def test_values_that_do_not_fit_are_refused() -> None:
+def test_values_that_do_not_fit_are_refused():
     with pytest.raises(DatagramError, match="LevelRequest"):
         messages.LevelRequest(1 << 16).pack()
     with pytest.raises(DatagramError, match="digest"):
@@ -117,7 +117,7 @@ def test_values_that_do_not_fit_are_refused() -> None:
     st.lists(st.integers(0, 2000), max_size=8),
     st.binary(max_size=100),
 )
-def test_decoder_does_not_care_about_portions(bodies: list[bytes], cuts: list[int], noise: bytes) -> None:
+def test_decoder_does_not_care_about_portions(bodies, cuts, noise):
     sent = [Datagram(12, 0, i, 7, body[:512]) for i, body in enumerate(bodies)]
     wire = noise + b"\0" + b"".join(d.encode() for d in sent)
     whole = DatagramDecoder()
@@ -132,14 +132,14 @@ def test_decoder_does_not_care_about_portions(bodies: list[bytes], cuts: list[in
 
 
 @given(st.binary(min_size=1, max_size=80), st.data())
-def test_a_flipped_byte_is_never_accepted_as_the_same(body: bytes, data: st.DataObject) -> None:
+def test_a_flipped_byte_is_never_accepted_as_the_same(body, data):
     wire = bytearray(Datagram(4, 0, 1, 2, body).encode())
     at = data.draw(st.integers(0, len(wire) - 2))
     wire[at] ^= data.draw(st.integers(1, 255))
     assert not DatagramDecoder().feed(bytes(wire))
 
 
-def test_endless_line_does_not_fill_memory() -> None:
+def test_endless_line_does_not_fill_memory():
     decoder = DatagramDecoder()
     for _ in range(100):
         assert decoder.feed(b"\x55" * 1000) == []
@@ -148,16 +148,16 @@ def test_endless_line_does_not_fill_memory() -> None:
     assert decoder.feed(b"\0" + good.encode()) == [good]
 
 
-def reply(request: Datagram, payload: bytes = b"", status: int = 0) -> bytes:
+def reply(request, payload=b"", status=0):
     return Datagram(request.type | 0x80, status, request.sequence, request.session, payload).encode()
 
 
-def sent(client: Client, now: float = 0.0) -> list[Datagram]:
+def sent(client, now=0.0):
     """What the client writes then."""
     return DatagramDecoder().feed(client.poll(now)[0])
 
 
-def test_window_bounds_what_is_under_way() -> None:
+def test_window_bounds_what_is_under_way():
     client = Client(Timing(), window=3)
     tokens = [client.submit(messages.CrcRequest(0, i, 1)) for i in range(5)]
     first = sent(client)
@@ -168,7 +168,7 @@ def test_window_bounds_what_is_under_way() -> None:
     assert len(sent(client)) == 1
 
 
-def test_tries_back_off_and_end() -> None:
+def test_tries_back_off_and_end():
     client = Client(Timing(1_000_000, latency_s=0.1))
     token = client.submit(messages.StopRequest())
     now, times = 0.0, []
@@ -188,7 +188,7 @@ def test_tries_back_off_and_end() -> None:
     assert client.retries == 4
 
 
-def test_late_doubled_and_foreign_answers_are_ignored() -> None:
+def test_late_doubled_and_foreign_answers_are_ignored():
     client = Client(Timing(), first=0xFFFF)
     client.submit(messages.CrcRequest(0, 0, 1))
     request = sent(client)[0]
@@ -206,7 +206,7 @@ def test_late_doubled_and_foreign_answers_are_ignored() -> None:
     assert sent(client, 1.0)[0].sequence == 0
 
 
-def test_refusal_carries_status_and_detail() -> None:
+def test_refusal_carries_status_and_detail():
     client = Client(Timing())
     for status in (messages.Status.OUT_OF_RANGE, 99):
         client.submit(messages.StopRequest())
@@ -215,7 +215,7 @@ def test_refusal_carries_status_and_detail() -> None:
         assert (outcome.status, outcome.detail, outcome.reply) == (status, 60, None)
 
 
-def answer(client: Client, now: float, after_s: float) -> float:
+def answer(client, now, after_s):
     """A CRC request that is sent again until its answer, which takes so long, is there; gives that time."""
     client.submit(messages.CrcRequest(0, 0, 1))
     wire, deadline = client.poll(now)
@@ -227,7 +227,7 @@ def answer(client: Client, now: float, after_s: float) -> float:
     return end
 
 
-def test_a_slow_board_gets_the_time_that_it_takes() -> None:
+def test_a_slow_board_gets_the_time_that_it_takes():
     client = Client(Timing(latency_s=0.1))
     now = 0.0
     for _ in range(20):

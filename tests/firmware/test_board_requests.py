@@ -2,20 +2,17 @@
 
 import zlib
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from board_lines import PACKET, some_bank
 
 from evlcp_sdk.air.codebook import word_of_chips
-from firmware_host.board.bank import Bank
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.protocol.datagram import Datagram, DatagramDecoder
 from firmware_host.protocol.generated import requests as protocol
 from firmware_host.protocol.generated.profiles import DIGESTS
 from firmware_host.protocol.generated.requests import MAJOR, MINOR, NO_BANK, NO_SESSION, State, Status
-from firmware_host.protocol.wire import WireRequest
 
 BANK = some_bank(1, 1)
 START, STOP, BLANK = protocol.StartRequest(), protocol.StopRequest(), protocol.BlankRequest()
@@ -25,16 +22,16 @@ RECALL, SAVE = protocol.RecallRequest(), protocol.SaveRequest(0)
 class Wire:
     """A host of few lines: one request, one answer."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.device = SimulatedBoard()
         self.sequence, self.session = 0xFFF0, NO_SESSION
         self.hello(0x12345678)
 
-    def hello(self, nonce: int) -> None:
+    def hello(self, nonce):
         assert self.ask(protocol.HelloRequest(MAJOR, MINOR, nonce), session=NO_SESSION) == Status.OK
         self.session = self.reply.session
 
-    def send(self, type_: int, payload: bytes, sequence: int, session: int) -> int:
+    def send(self, type_, payload, sequence, session):
         self.device.receive(Datagram(type_, 0, sequence, session, payload).encode())
         self.device.run(0)
         (self.reply,) = DatagramDecoder().feed(self.device.sent())
@@ -42,42 +39,42 @@ class Wire:
         self.detail = int.from_bytes(self.reply.payload[:4], "little")
         return self.reply.status
 
-    def ask(self, request: WireRequest[Any], sequence: int | None = None, session: int | None = None) -> int:
+    def ask(self, request, sequence=None, session=None):
         if sequence is None:
             sequence = self.sequence = (self.sequence + 1) & 0xFFFF
         return self.send(request.TYPE, request.pack(), sequence, self.session if session is None else session)
 
-    def each(self, *requests: WireRequest[Any]) -> list[int]:
+    def each(self, *requests):
         """How requests end, one after the other."""
         return [self.ask(request) for request in requests]
 
-    def status(self) -> protocol.StatusReply:
+    def status(self):
         assert self.ask(protocol.StatusRequest()) == Status.OK
         return protocol.StatusReply.unpack(self.reply.payload)
 
-    def fill(self, number: int, content: bytes) -> None:
+    def fill(self, number, content):
         for at in range(0, len(content), 500):
             assert self.ask(protocol.WriteRequest(number, at, content[at : at + 500])) == Status.OK
 
-    def committed(self) -> None:
+    def committed(self):
         self.fill(0, BANK.content)
         assert self.ask(commit_of(BANK)) == Status.OK
 
-    def chips(self, count: int) -> None:
+    def chips(self, count):
         self.device.run(100 * count)
 
 
 @pytest.fixture
-def wire() -> Wire:
+def wire():
     return Wire()
 
 
-def commit_of(bank: Bank, number: int = 0) -> protocol.CommitRequest:
+def commit_of(bank, number=0):
     digest = bytes.fromhex(bank.digest)
     return protocol.CommitRequest(number, bank.format, bank.packets, len(bank.content), bank.crc, digest)
 
 
-def test_the_line_counts_what_it_drops(wire: Wire) -> None:
+def test_the_line_counts_what_it_drops(wire):
     status = Datagram(protocol.StatusRequest.TYPE, 0, 9, wire.session, b"").encode()
     spoilt = status[:3] + bytes([status[3] ^ 0x40]) + status[4:]
     # a wrong byte, one that ends within a block, one too long; and delimiters alone
@@ -91,7 +88,7 @@ def test_the_line_counts_what_it_drops(wire: Wire) -> None:
     assert wire.status().overflow_errors == 100
 
 
-def test_sessions(wire: Wire) -> None:
+def test_sessions(wire):
     first = wire.session
     wire.hello(0x12345678)
     assert wire.session == first
@@ -111,7 +108,7 @@ def test_sessions(wire: Wire) -> None:
     assert wire.send(protocol.StartRequest.TYPE, bytes(11), 3, wire.session) == Status.BAD_LENGTH
 
 
-def test_a_control_request_is_done_once_and_none_that_is_older(wire: Wire) -> None:
+def test_a_control_request_is_done_once_and_none_that_is_older(wire):
     level = protocol.LevelRequest
     assert wire.ask(level(30)) == Status.OK
     one = wire.sequence
@@ -130,7 +127,7 @@ def test_a_control_request_is_done_once_and_none_that_is_older(wire: Wire) -> No
     assert (wire.device.bench.level_ma, wire.status().level_ma) == (50, 50)
 
 
-def test_dark_until_commit_and_start(wire: Wire) -> None:
+def test_dark_until_commit_and_start(wire):
     wire.device.records()
     assert wire.ask(START) == Status.NOTHING_COMMITTED
     wire.fill(0, BANK.content)
@@ -149,7 +146,7 @@ def test_dark_until_commit_and_start(wire: Wire) -> None:
     assert (played.chips() == BANK.chips[:100]).all()
 
 
-def test_stop_ends_with_the_packet_and_blank_at_once(wire: Wire) -> None:
+def test_stop_ends_with_the_packet_and_blank_at_once(wire):
     wire.committed()
     wire.ask(START)
     wire.chips(40)
@@ -174,8 +171,8 @@ def test_stop_ends_with_the_packet_and_blank_at_once(wire: Wire) -> None:
     assert wire.status().state == State.PLAYING
 
 
-def test_banks_are_held(wire: Wire) -> None:
-    def banks() -> tuple[int, int]:
+def test_banks_are_held(wire):
+    def banks():
         return wire.status().active_bank, wire.status().pending_bank
 
     other = some_bank(1, 2)
@@ -198,7 +195,7 @@ def test_banks_are_held(wire: Wire) -> None:
     assert wire.ask(protocol.ReadRequest(0, 0, 508)) == Status.OUT_OF_RANGE
 
 
-def test_a_foreign_codebook_never_plays(wire: Wire) -> None:
+def test_a_foreign_codebook_never_plays(wire):
     wire.fill(0, BANK.content)
     commit = commit_of(BANK)
     foreign = replace(commit, digest=bytes.fromhex(DIGESTS[protocol.Profile.WH8]))
@@ -222,7 +219,7 @@ def test_a_foreign_codebook_never_plays(wire: Wire) -> None:
     assert wire.device.records().chips()[:, 0].tolist() == [1, 0]
 
 
-def test_limits_of_configure(wire: Wire) -> None:
+def test_limits_of_configure(wire):
     good = protocol.ConfigureRequest(20_000, 0, 10, 1, 0, 0)
     for name, value, nearest in (
         *[("chip_rate_hz", rate, near) for rate, near in ((0, 1), (3, 2), (7125, 6250), (2**32 - 1, 20_000))],
@@ -246,7 +243,7 @@ def test_limits_of_configure(wire: Wire) -> None:
     assert (wire.ask(commit_of(BANK, 1)), wire.detail) == (Status.BUSY, 20_000)
 
 
-def test_a_chip_that_comes_a_whole_chip_late_ends_in_the_dark(wire: Wire) -> None:
+def test_a_chip_that_comes_a_whole_chip_late_ends_in_the_dark(wire):
     wire.committed()
     wire.ask(START)
     wire.device.bench.late = 999
@@ -258,7 +255,7 @@ def test_a_chip_that_comes_a_whole_chip_late_ends_in_the_dark(wire: Wire) -> Non
     assert not wire.device.shown().any()
 
 
-def test_the_idle_pattern_begins_with_a_packet_and_ends_with_one(wire: Wire) -> None:
+def test_the_idle_pattern_begins_with_a_packet_and_ends_with_one(wire):
     watchdog = protocol.WatchdogRequest
     found = wire.each(watchdog(3, 100), watchdog(1, 99), watchdog(1, 100))
     assert found == [Status.OUT_OF_RANGE, Status.OUT_OF_RANGE, Status.OK]
@@ -278,7 +275,7 @@ def test_the_idle_pattern_begins_with_a_packet_and_ends_with_one(wire: Wire) -> 
     assert wire.status().state == State.PLAYING
 
 
-def test_slots_of_save(wire: Wire) -> None:
+def test_slots_of_save(wire):
     assert wire.each(RECALL, SAVE) == [Status.EMPTY_SLOT, Status.NOTHING_COMMITTED]
     wire.committed()
     assert wire.each(protocol.SaveRequest(2), SAVE) == [Status.OUT_OF_RANGE, Status.OK]

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 from board_lines import board_on, some_bank, state_of
-from numpy.typing import NDArray
 
-from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.board import Settings, provision
 from firmware_host.board.step import start_together, wait_for_pulse
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import LineError, RefusedError
@@ -14,7 +13,7 @@ from firmware_host.protocol.generated.requests import BoardFault, State
 CHIP_US = 100.0
 
 
-def crystal(ppm: float = 0.0) -> tuple[SimulatedBoard, Board]:
+def crystal(ppm=0.0):
     """A programmed board whose crystal is off by `ppm`, with a pulse of a true clock each second."""
     device = SimulatedBoard()
     rate = 1 + ppm * 1e-6
@@ -24,12 +23,12 @@ def crystal(ppm: float = 0.0) -> tuple[SimulatedBoard, Board]:
     return device, board
 
 
-def times_us(device: SimulatedBoard, ppm: float) -> NDArray[np.float64]:
+def times_us(device, ppm):
     """True times of the chips played."""
     return device.records().played().ticks / 10 / (1 + ppm * 1e-6)
 
 
-def test_boards_60_ppm_apart_stay_within_a_hundredth_of_a_chip_until_pulses_cease() -> None:
+def test_boards_60_ppm_apart_stay_within_a_hundredth_of_a_chip_until_pulses_cease():
     found = []
     for ppm in (30.0, -30.0):
         device, board = crystal(ppm)
@@ -57,7 +56,7 @@ def test_boards_60_ppm_apart_stay_within_a_hundredth_of_a_chip_until_pulses_ceas
     assert abs(found[0][0] - (4.5e6 + CHIP_US)) < 1
 
 
-def test_start_at_a_clock() -> None:
+def test_start_at_a_clock():
     device, board = crystal()
     clock = board.status().clock
     board.start(at_clock=clock + 300_000)
@@ -74,7 +73,7 @@ def test_start_at_a_clock() -> None:
     assert board.status().state == State.DARK
 
 
-def test_a_pulse_that_does_not_come_is_told_and_the_board_stopped() -> None:
+def test_a_pulse_that_does_not_come_is_told_and_the_board_stopped():
     device, board = crystal()
     device.bench.pulse_period, device.bench.pulse_next = 0, 0
     assert start_together([board]) == [3]
@@ -89,7 +88,7 @@ def test_a_pulse_that_does_not_come_is_told_and_the_board_stopped() -> None:
     assert board.status().state == State.PLAYING
 
 
-def test_what_cannot_be_is_refused() -> None:
+def test_what_cannot_be_is_refused():
     device, board = crystal()
     for pulses in (0, 3):
         device.run(pulses * 1_000_000)
@@ -109,7 +108,7 @@ def test_what_cannot_be_is_refused() -> None:
     assert ready.status().state == State.DARK
 
 
-def test_the_stm32_keeps_in_step(stm32) -> None:
+def test_the_stm32_keeps_in_step(stm32):
     """Crystals 600 ppm apart: in 10 ms they drift by 0.06 chips, in step they stay within 0.03."""
     from tests.models.stm32 import UNIT_HZ, US, Dma
 

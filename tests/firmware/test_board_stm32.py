@@ -1,13 +1,10 @@
 """The STM32F405 image as it is flashed, on a model of the part: every LED, chip by chip, and what fails."""
 
 import subprocess
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 from board_lines import board_link, state_of, symbols_of, well
-from numpy.typing import NDArray
 from test_board_cli import Emulated
 
 from firmware_host import build
@@ -17,7 +14,7 @@ from firmware_host.errors import RefusedError
 from firmware_host.protocol.generated.requests import BoardFault, State
 
 pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-from tests.models.stm32 import RESET_BY_IWDG, RESET_BY_PIN, US, Dma, Shown, Stm32, Usart, connect, lit_rows
+from tests.models.stm32 import RESET_BY_IWDG, RESET_BY_PIN, US, Dma, Usart, connect, lit_rows
 
 CHIP = 100 * US
 BOOT_US = 15_000
@@ -27,19 +24,19 @@ FOUR = board_link("air.frames_per_packet=4")
 class Bar:
     """A programmed board on the model, dark."""
 
-    def __init__(self, chip: Stm32) -> None:
+    def __init__(self, chip):
         self.chip = chip
         self.board = connect(chip)
         symbols = symbols_of(1, 1, FOUR)
         provision(self.board, bank_of(symbols, FOUR), Settings(start=False))
         self.chips = symbol_chips(symbols, FOUR.codebook)
 
-    def expected(self, count: int) -> NDArray[np.uint8]:
+    def expected(self, count):
         """Rows from the first lit chip on, (count, 96)."""
         first = int(self.chips.any(1).argmax())
         return np.repeat(np.resize(np.roll(self.chips, -first, axis=0), (count, 16)), 6, axis=1)
 
-    def play(self, us: float, least: int) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    def play(self, us, least):
         """Start, and see that all rows are right, at least so many; these from the first lit on, and when."""
         begin = len(self.log)
         self.board.start()
@@ -50,30 +47,30 @@ class Bar:
         return rows, times
 
     @property
-    def log(self) -> list[Shown]:
+    def log(self):
         return self.chip.drivers.log
 
     @property
-    def dark(self) -> bool:
+    def dark(self):
         return self.chip.drivers.dark
 
 
 @pytest.fixture(scope="module")
-def programmed(stm32) -> tuple[Bar, Callable[[], None]]:
+def programmed(stm32):
     """The bar that all tests share, and what sets it back."""
     bar = Bar(stm32()[0])
     return bar, bar.chip.snapshot()
 
 
 @pytest.fixture
-def bar(programmed: tuple[Bar, Callable[[], None]]) -> Bar:
+def bar(programmed):
     bar, back = programmed
     back()
     bar.board = connect(bar.chip)
     return bar
 
 
-def test_every_start_shows_every_chip_on_every_led(bar: Bar) -> None:
+def test_every_start_shows_every_chip_on_every_led(bar):
     for _ in range(2):
         begin = len(bar.log)
         _, times = bar.play(21_500, 200)
@@ -92,7 +89,7 @@ def test_every_start_shows_every_chip_on_every_led(bar: Bar) -> None:
         assert (rows[:lit] == bar.expected(lit)).all()
 
 
-def test_registers_are_those_of_the_schematic(bar: Bar) -> None:
+def test_registers_are_those_of_the_schematic(bar):
     chip = bar.chip
     gpio_a, gpio_b = 0x40020000, 0x40020400
     # TIM2 on PA0, SPI1 and TIM3 on PA5 PA6 PA7, USART1 on PA9 PA10, DAC on PA4; PB0 drives, PB1 is pulled up
@@ -109,11 +106,11 @@ def test_registers_are_those_of_the_schematic(bar: Bar) -> None:
     assert (bar.board.about.tick_hz, bar.board.about.hal.rstrip(b"\0")) == (14_000_000, b"stm32f405")
 
 
-def end_stream(chip: Stm32) -> None:
+def end_stream(chip):
     chip.dma.cr &= ~1
 
 
-BREAKS: dict[str, tuple[Callable[[Stm32], object], BoardFault, float]] = {
+BREAKS = {
     "tim1": (lambda chip: chip.tim1.stop_for_good(), BoardFault.CHIP_LOST, 1.6),
     "stream-stands": (lambda chip: setattr(chip.dma, "dead", True), BoardFault.CHIP_LOST, 1.6),
     "stream-ends": (end_stream, BoardFault.CHIP_LOST, 1.6),
@@ -129,7 +126,7 @@ BREAKS: dict[str, tuple[Callable[[Stm32], object], BoardFault, float]] = {
 
 
 @pytest.mark.parametrize("what", BREAKS)
-def test_what_fails_while_playing_ends_in_the_dark(bar: Bar, what: str) -> None:
+def test_what_fails_while_playing_ends_in_the_dark(bar, what):
     breaks, fault, most_chips = BREAKS[what]
     rng = np.random.default_rng(list(BREAKS).index(what))
     bar.board.start()
@@ -153,7 +150,7 @@ def test_what_fails_while_playing_ends_in_the_dark(bar: Bar, what: str) -> None:
     assert bar.chip.resets == [RESET_BY_PIN]
 
 
-def test_stop_ends_in_the_dark_on_a_stream_that_dies_meanwhile(bar: Bar) -> None:
+def test_stop_ends_in_the_dark_on_a_stream_that_dies_meanwhile(bar):
     for moment in (0, 70, 250):
         bar.board.start()
         bar.chip.run(5_000 + moment)
@@ -170,7 +167,7 @@ def test_stop_ends_in_the_dark_on_a_stream_that_dies_meanwhile(bar: Bar) -> None
     assert bar.board.status().state == State.PLAYING
 
 
-def test_no_crystal_then_no_chip(bar: Bar) -> None:
+def test_no_crystal_then_no_chip(bar):
     bar.chip.stop_crystal()
     bar.chip.run(1_000)
     # at 16 MHz the line rate is kept
@@ -182,7 +179,7 @@ def test_no_crystal_then_no_chip(bar: Bar) -> None:
     assert 49 <= bar.board.status().uptime_ms - before <= 54
 
 
-def test_led_test_shows_one_led_and_nothing_on_a_dead_spi(bar: Bar) -> None:
+def test_led_test_shows_one_led_and_nothing_on_a_dead_spi(bar):
     begin = len(bar.log)
     bar.board.test_leds(0, 95, 1)
     bar.board.wait_dark()
@@ -195,7 +192,7 @@ def test_led_test_shows_one_led_and_nothing_on_a_dead_spi(bar: Bar) -> None:
     assert bar.board.status().state == State.FAULT
 
 
-def test_save_outlives_the_watchdog_and_autostart_waits_for_start_after_its_reset(bar: Bar) -> None:
+def test_save_outlives_the_watchdog_and_autostart_waits_for_start_after_its_reset(bar):
     bar.board.save(autostart=True)
     bar.chip.run(20_000)
     assert bar.chip.resets == [RESET_BY_PIN]
@@ -215,7 +212,7 @@ def test_save_outlives_the_watchdog_and_autostart_waits_for_start_after_its_rese
 
 
 @pytest.mark.parametrize("what", ["hangs", "hangs-in-chip", "stands", "faults"])
-def test_a_core_that_stops_is_reset_and_stays_dark(bar: Bar, what: str) -> None:
+def test_a_core_that_stops_is_reset_and_stays_dark(bar, what):
     bar.board.start()
     bar.chip.run(8_000)
     assert not bar.dark
@@ -247,7 +244,7 @@ def test_a_core_that_stops_is_reset_and_stays_dark(bar: Bar, what: str) -> None:
     assert bar.dark
 
 
-def test_a_broken_thermal_wire_is_too_hot(bar: Bar) -> None:
+def test_a_broken_thermal_wire_is_too_hot(bar):
     bar.board.start()
     bar.chip.run(5_000)
     assert not bar.dark
@@ -266,7 +263,7 @@ def test_a_broken_thermal_wire_is_too_hot(bar: Bar) -> None:
     assert not bar.dark
 
 
-def test_led_test_and_save_wait_until_the_last_rows_have_left(bar: Bar) -> None:
+def test_led_test_and_save_wait_until_the_last_rows_have_left(bar):
     for then in ("test", "save"):
         bar.board.start()
         bar.chip.run(5_000)
@@ -289,7 +286,7 @@ def test_led_test_and_save_wait_until_the_last_rows_have_left(bar: Bar) -> None:
         bar.board.blank()
 
 
-def test_emulate_serves_the_model(evlcp, stm32, tmp_path: Path) -> None:
+def test_emulate_serves_the_model(evlcp, stm32, tmp_path):
     listen, record, out = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "chips.npy"
     emulated = Emulated("stm32", "--listen", listen, "--leds", record)
     try:
@@ -309,7 +306,7 @@ def test_emulate_serves_the_model(evlcp, stm32, tmp_path: Path) -> None:
     assert not chips[start + whole :].any()
 
 
-def symbol(name: str) -> int:
+def symbol(name):
     """Address of a variable of the image."""
     table = subprocess.run(
         ["arm-none-eabi-nm", build.arm_image("stm32f405")], capture_output=True, text=True, check=True
@@ -317,7 +314,7 @@ def symbol(name: str) -> int:
     return next(int(line.split()[0], 16) for line in table.splitlines() if line.split()[-1] == name)
 
 
-def test_counters_pass_two_to_the_32(bar: Bar) -> None:
+def test_counters_pass_two_to_the_32(bar):
     """TIM2, the milliseconds, the chips and the packets sent all wrap while it plays."""
     chip = bar.chip
     bar.board.start()
@@ -346,7 +343,7 @@ def test_counters_pass_two_to_the_32(bar: Bar) -> None:
     assert (status.state, status.faults) == (State.PLAYING, 0)
 
 
-def test_interrupts_stack_and_line_have_room(bar: Bar) -> None:
+def test_interrupts_stack_and_line_have_room(bar):
     """At 20 000 chips per second and 1 Mbit/s both ways: no byte lost, no chip late."""
     chip = bar.chip
     lowest = symbol("link_bss_end")

@@ -1,6 +1,5 @@
 """Streams: every packet once and in order over any line, underruns named, dark at the end."""
 
-from collections.abc import Iterator
 from contextlib import suppress
 
 import numpy as np
@@ -17,14 +16,11 @@ from board_lines import (
     symbols_of,
 )
 from hypothesis import given, settings, strategies as st
-from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import Link
 from firmware_host.board.bank import bank_of, queue_of
-from firmware_host.board.board import Board, Settings, provision
-from firmware_host.board.stream import Stream
+from firmware_host.board.board import Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import BoardResetError, IncompatibleError, RefusedError, VerifyError
 from firmware_host.protocol.generated import requests as protocol
@@ -34,18 +30,18 @@ from tests.models.usb import UsbLine
 LONG = board_link("air.frames_per_packet=40", "air.pilot_every=4")
 
 
-def played(device: SimulatedBoard, link: Link = LINK) -> tuple[list[bytes], int]:
+def played(device, link=LINK):
     found, idle = packets_shown(device.records().played().chips(), link)
     return [packet.tobytes() for packet in found], idle
 
 
-def expected(packets: np.ndarray, link: Link = LINK) -> list[bytes]:
+def expected(packets, link=LINK):
     return [packet_chips(p, link.codebook, link.packet.pilot_every).tobytes() for p in packets]
 
 
 @pytest.mark.parametrize("link", [LINK, LONG], ids=["one piece a packet", "three pieces a packet"])
 @pytest.mark.parametrize(("latency_s", "ahead"), [(0.0, 5), (0.016, 2)])
-def test_packets_follow_without_a_gap(device, link, latency_s, ahead) -> None:
+def test_packets_follow_without_a_gap(device, link, latency_s, ahead):
     packets = symbols_of(30, 0, link)
     with board_on(UsbLine(device, latency_s), nonce=1).stream(link, ahead) as stream:
         for n, packet in enumerate(packets):
@@ -65,7 +61,7 @@ def test_packets_follow_without_a_gap(device, link, latency_s, ahead) -> None:
     assert not device.shown().any()
 
 
-def test_an_empty_queue_is_named_and_shows_the_idle_pattern(device: SimulatedBoard) -> None:
+def test_an_empty_queue_is_named_and_shows_the_idle_pattern(device):
     board = board_on(UsbLine(device, 0.001), nonce=1)
     packets = symbols_of(4)
     with board.stream(LINK) as stream:
@@ -88,14 +84,14 @@ def test_an_empty_queue_is_named_and_shows_the_idle_pattern(device: SimulatedBoa
     assert (after.state, after.faults, after.underruns) == (State.DARK, 0, 1)
 
 
-def status_of(stream: Stream) -> protocol.StatusReply:
+def status_of(stream):
     """STATUS in between; nothing of the stream is under way then."""
     assert not stream._flight
     return stream._session.call(protocol.StatusRequest())
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_noisy_line_loses_and_doubles_nothing(device: SimulatedBoard, seed: int) -> None:
+def test_a_noisy_line_loses_and_doubles_nothing(device, seed):
     line = NoisyLine(device, 0.0, 0.0, 0.0, seed)
     board = board_on(line, nonce=1, latency_s=0.004, tries=12)
     link = LONG if seed % 2 else LINK
@@ -111,7 +107,7 @@ def test_a_noisy_line_loses_and_doubles_nothing(device: SimulatedBoard, seed: in
     assert found == expected(packets, link)
 
 
-def test_from_a_bank_to_a_stream_and_back_without_a_torn_packet(device: SimulatedBoard, board: Board) -> None:
+def test_from_a_bank_to_a_stream_and_back_without_a_torn_packet(device, board):
     first, second, last = symbols_of(2, 1), symbols_of(5, 2), symbols_of(1, 3)
     provision(board, bank_of(first, LINK), Settings())
     device.run(100_000)
@@ -132,7 +128,7 @@ def test_from_a_bank_to_a_stream_and_back_without_a_torn_packet(device: Simulate
     assert (status.state, status.underruns, status.packets) == (State.PLAYING, 0, 1)
 
 
-def test_the_watchdog_acts_on_a_stream_whose_host_is_gone(device: SimulatedBoard, board: Board) -> None:
+def test_the_watchdog_acts_on_a_stream_whose_host_is_gone(device, board):
     board.watchdog(Watchdog.DARK, 200)
     stream = board.stream(LINK)
     stream.send(symbols_of(1)[0])
@@ -142,7 +138,7 @@ def test_the_watchdog_acts_on_a_stream_whose_host_is_gone(device: SimulatedBoard
     assert not device.shown().any()
 
 
-def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_told(device: SimulatedBoard, board: Board) -> None:
+def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_told(device, board):
     with suppress(KeyError), board.stream(LINK, 8) as stream:
         for packet in symbols_of(4):
             stream.send(packet)
@@ -155,7 +151,7 @@ def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_told(device: SimulatedBo
         stream.wait(2.0)
 
 
-def test_what_a_board_refuses(device: SimulatedBoard, board: Board) -> None:
+def test_what_a_board_refuses(device, board):
     for ahead, says in ((1, "expected 2 or more"), (500, "holds 127 packets")):
         with pytest.raises(ConfigError, match=says):
             board.stream(LINK, ahead)
@@ -185,13 +181,13 @@ def test_what_a_board_refuses(device: SimulatedBoard, board: Board) -> None:
 class Queue:
     """What a board's queue should do, in Python."""
 
-    def __init__(self, slots: int, size: int) -> None:
+    def __init__(self, slots, size):
         self.slots, self.size = slots, size
-        self.packets: list[bytes] = []
+        self.packets = []
         self.part = b""
         self.ended = False
 
-    def push(self, number: int, offset: int, data: bytes, last: bool, begun: int) -> tuple[int, int]:
+    def push(self, number, offset, data, last, begun):
         room = len(self.packets) - begun + 1 < self.slots
         is_next = (number, offset) == (len(self.packets), len(self.part))
         if is_next and data and room and not self.ended and offset + len(data) <= self.size:
@@ -206,7 +202,7 @@ class Queue:
 
 @given(st.data())
 @settings(max_examples=30, deadline=None)
-def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
+def test_the_queue_takes_what_a_queue_should(data):
     """Pieces of any number, offset and length, and time between them, against a model."""
     link = board_link("air.frames_per_packet=320")  # 10 240 bytes a packet: 4 slots
     device = SimulatedBoard()
@@ -220,7 +216,7 @@ def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
     model = Queue(slots, 10_240)
     begun = 0
 
-    def push(number: int, offset: int, payload: bytes, last: bool = False) -> None:
+    def push(number, offset, payload, last=False):
         nonlocal begun
         reply = board.session.call(protocol.PushRequest(0, number, offset, int(last), payload))
         # the model knows when packets begin only from the board; they never go back
@@ -250,7 +246,7 @@ def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
         assert held[at : at + 10_240] == model.packets[n]
 
 
-def test_masks_may_be_streamed_too(device: SimulatedBoard, board: Board) -> None:
+def test_masks_may_be_streamed_too(device, board):
     like = queue_of(LINK)
     board.prepare(like)
     digest = bytes.fromhex(LINK.codebook.digest)
@@ -270,7 +266,7 @@ def test_masks_may_be_streamed_too(device: SimulatedBoard, board: Board) -> None
 
 
 @pytest.mark.parametrize("latency_s", [0.0, 0.016])
-def test_what_changes_is_right_at_its_first_chip(device: SimulatedBoard, latency_s: float) -> None:
+def test_what_changes_is_right_at_its_first_chip(device, latency_s):
     """A countdown made for `delay_s` ahead, against the ticks at which the board showed it."""
     from benchmarks.board import starts_of
     from evlcp_sdk.air.blocks import Kind, Message
@@ -278,11 +274,11 @@ def test_what_changes_is_right_at_its_first_chip(device: SimulatedBoard, latency
     from evlcp_sdk.link.compose import packets_of
 
     board, coder = board_on(UsbLine(device, latency_s)), LINK.block_coder()
-    made: list[np.ndarray] = []
-    due_us: list[float] = []
+    made = []
+    due_us = []
     with board.stream(LINK, 2) as stream:
 
-        def next_one(number: int) -> np.ndarray | None:
+        def next_one(number):
             if number == 8:
                 return None
             at_s = device.now_us * 1e-6 + stream.delay_s
@@ -307,7 +303,7 @@ def test_what_changes_is_right_at_its_first_chip(device: SimulatedBoard, latency
 
 @pytest.mark.parametrize("how", ["stop", "blank"])
 @pytest.mark.parametrize("at_once", [False, True])
-def test_a_stopped_stream_is_empty(device: SimulatedBoard, board: Board, how: str, at_once: bool) -> None:
+def test_a_stopped_stream_is_empty(device, board, how, at_once):
     """What waits is not played by another START, nor by one that comes before the board is dark."""
     sent = symbols_of(6)
     stream = board.stream(LINK, ahead=6)
@@ -333,8 +329,8 @@ def test_a_stopped_stream_is_empty(device: SimulatedBoard, board: Board, how: st
     board.verify(some_bank())
 
 
-def test_messages_are_played_until_they_are_stopped(device: SimulatedBoard, board: Board) -> None:
-    asked: list[int] = []
+def test_messages_are_played_until_they_are_stopped(device, board):
+    asked = []
     with board.stream(LINK) as stream:
         stream.play(lambda _: symbols_of(3), 60.0, lambda: len(asked) > 20 or asked.append(0) is not None)
     assert stream.sent < 22
@@ -342,15 +338,15 @@ def test_messages_are_played_until_they_are_stopped(device: SimulatedBoard, boar
     assert (status.state, status.packets_sent) == (State.DARK, stream.sent)
 
 
-def test_a_text_of_many_packets_leaves_no_gap(board: Board) -> None:
+def test_a_text_of_many_packets_leaves_no_gap(board):
     """Each takes half as long to make as to play: all of them at once would starve the board."""
     line = board.session.transport
     some = symbols_of(25)
 
     with board.stream(LINK, 2) as stream:
 
-        def slowly(number: int) -> Iterator[NDArray[np.int64]] | None:
-            def made() -> Iterator[NDArray[np.int64]]:
+        def slowly(number):
+            def made():
                 for packet in some:
                     stream.wait(stream.packet_s / 2)
                     yield packet

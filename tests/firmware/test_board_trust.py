@@ -3,14 +3,12 @@
 import contextlib
 import hashlib
 import json
-from pathlib import Path
-from typing import Any
 
 import pytest
 from board_lines import LINK, Native, board_on, check_fault, recording, some_bank, symbols_of
 from hypothesis import given, settings, strategies as st
 
-from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.board import Settings, provision
 from firmware_host.board.keys import make_board_key, read_board_key
 from firmware_host.board.monitor import Unheard, watch
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
@@ -18,26 +16,25 @@ from firmware_host.errors import RefusedError
 from firmware_host.protocol.datagram import Datagram, DatagramDecoder
 from firmware_host.protocol.generated import requests as protocol
 from firmware_host.protocol.generated.requests import State, Status, StatusReply, Watchdog
-from tests.conftest import Run
 
 KEY = bytes(range(1, 17))
 OTHER = bytes(range(2, 18))
 BANK = some_bank(2)
 
 
-def locked(device: SimulatedBoard, key: bytes = KEY) -> Board:
+def locked(device, key=KEY):
     board = board_on(device)
     board.set_key(key)
     return board
 
 
-def held(device: SimulatedBoard) -> tuple[object, ...]:
+def held(device):
     """What a request that is refused leaves as it is."""
     status = board_on(device).status()
     return (status.state, status.level_ma, status.commits, status.watchdog)
 
 
-def test_a_locked_board_does_all_with_its_key_and_nothing_without(device: SimulatedBoard) -> None:
+def test_a_locked_board_does_all_with_its_key_and_nothing_without(device):
     board = locked(device)
     assert board.about.key_name == hashlib.sha256(KEY).digest()[:4]
     assert provision(board, BANK, Settings(level_ma=15)).swapped
@@ -77,7 +74,7 @@ def test_a_locked_board_does_all_with_its_key_and_nothing_without(device: Simula
 
 @given(st.integers(0, 490), st.binary(min_size=16, max_size=16).filter(any))
 @settings(max_examples=40, deadline=None)
-def test_seals_are_hmac_sha256_of_any_length(count: int, key: bytes) -> None:
+def test_seals_are_hmac_sha256_of_any_length(count, key):
     """The firmware's HMAC against hashlib's, over every length of a block."""
     board = locked(SimulatedBoard(), key)
     count = min(count, board.session.max_payload - protocol.WriteRequest.fixed_bytes())
@@ -87,7 +84,7 @@ def test_seals_are_hmac_sha256_of_any_length(count: int, key: bytes) -> None:
     assert not count or board.read(1, 7, count) == data
 
 
-def test_any_bit_that_is_changed_is_found(device: SimulatedBoard) -> None:
+def test_any_bit_that_is_changed_is_found(device):
     board = locked(device)
     line, client = SimulatedLine(device), board.session.client
     client.submit(protocol.LevelRequest(33))
@@ -95,7 +92,7 @@ def test_any_bit_that_is_changed_is_found(device: SimulatedBoard) -> None:
     client.forget()
     good = Datagram.decode(wire[:-1])
     body = bytes([good.type, good.status]) + good.sequence.to_bytes(2, "little") + good.payload
-    answers: set[int] = set()
+    answers = set()
     for bit in range(8 * len(body)):
         b = bytearray(body)
         b[bit // 8] ^= 1 << bit % 8
@@ -110,7 +107,7 @@ def test_any_bit_that_is_changed_is_found(device: SimulatedBoard) -> None:
     assert device.bench.level_ma == 33
 
 
-def replayed(line: SimulatedLine, wire: bytes) -> list[int]:
+def replayed(line, wire):
     """Statuses of the answers to bytes that are played back, one datagram after the other."""
     found = []
     for part in wire.rstrip(b"\0").split(b"\0"):
@@ -119,7 +116,7 @@ def replayed(line: SimulatedLine, wire: bytes) -> list[int]:
     return found
 
 
-def session_of(device: SimulatedBoard, key: bytes | None) -> bytes:
+def session_of(device, key):
     """What a host sends that sets a level, programs, starts and stops."""
     line = recording(device)
     board = board_on(line, key=key)
@@ -129,7 +126,7 @@ def session_of(device: SimulatedBoard, key: bytes | None) -> bytes:
     return line.written
 
 
-def test_what_was_recorded_works_again_on_a_board_without_a_key_and_not_on_one_with() -> None:
+def test_what_was_recorded_works_again_on_a_board_without_a_key_and_not_on_one_with():
     plain = SimulatedBoard()
     wire = session_of(plain, None)
     plain.reset()
@@ -152,7 +149,7 @@ def test_what_was_recorded_works_again_on_a_board_without_a_key_and_not_on_one_w
 
 
 @pytest.mark.parametrize("wraps", [False, True])
-def test_nor_is_anything_done_twice_in_a_session(device: SimulatedBoard, wraps: bool) -> None:
+def test_nor_is_anything_done_twice_in_a_session(device, wraps):
     """Not even when the numbers of its requests wrap."""
     locked(device)
     line = recording(device)
@@ -172,7 +169,7 @@ def test_nor_is_anything_done_twice_in_a_session(device: SimulatedBoard, wraps: 
     assert device.bench.level_ma == 44
 
 
-def test_who_has_no_key_does_not_stand_in_for_the_host(device: SimulatedBoard) -> None:
+def test_who_has_no_key_does_not_stand_in_for_the_host(device):
     board = locked(device)
     provision(board, BANK, Settings(watchdog=Watchdog.DARK, watchdog_ms=500))
     stranger = board_on(device)
@@ -183,9 +180,9 @@ def test_who_has_no_key_does_not_stand_in_for_the_host(device: SimulatedBoard) -
     assert stranger.status().state == State.DARK
 
 
-def test_a_monitor_without_the_key_says_that_the_watchdog_acts(device: SimulatedBoard) -> None:
-    def kinds(key: bytes | None) -> list[type]:
-        def opened() -> Any:
+def test_a_monitor_without_the_key_says_that_the_watchdog_acts(device):
+    def kinds(key):
+        def opened():
             return contextlib.nullcontext(board_on(device, key=key))
 
         return [type(seen) for seen in watch(opened, 0.01, count=2)]
@@ -199,7 +196,7 @@ def test_a_monitor_without_the_key_says_that_the_watchdog_acts(device: Simulated
     assert kinds(None) == [StatusReply] * 2
 
 
-def test_a_key_is_kept_and_changed(device: SimulatedBoard) -> None:
+def test_a_key_is_kept_and_changed(device):
     board = locked(device)
     device.reset()
     assert not any(board_on(device).about.key_name), "not saved"
@@ -229,7 +226,7 @@ def test_a_key_is_kept_and_changed(device: SimulatedBoard) -> None:
 # -- command line
 
 
-def test_a_key_is_its_owners_alone(evlcp, tmp_path: Path) -> None:
+def test_a_key_is_its_owners_alone(evlcp, tmp_path):
     file = tmp_path / "bar.key"
     made = evlcp("board", "keygen", file)
     assert (made.code, file.stat().st_mode & 0o777) == (0, 0o600)
@@ -247,16 +244,16 @@ def test_a_key_is_its_owners_alone(evlcp, tmp_path: Path) -> None:
         check_fault(evlcp("board", "--key", file, "--port", "native:", "hello"), 3, "expected 32 hex digits")
 
 
-def test_locked_from_the_command_line(evlcp, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_locked_from_the_command_line(evlcp, monkeypatch, tmp_path):
     port, file, other = f"unix:{tmp_path / 'board'}", tmp_path / "bar.key", tmp_path / "other.key"
     name, _ = make_board_key(file), make_board_key(other)
     assert read_board_key(file) != read_board_key(other)
     emulated = Native(port, flash=tmp_path / "f.bin")
 
-    def board(*arguments: object) -> Run:
+    def board(*arguments):
         return evlcp("board", *arguments, "--port", port)
 
-    def key() -> str | None:
+    def key():
         return json.loads(board("hello", "--json").out)["key"]
 
     assert key() is None
@@ -288,7 +285,7 @@ def test_locked_from_the_command_line(evlcp, monkeypatch: pytest.MonkeyPatch, tm
     emulated.end()
 
 
-def test_the_image_of_the_part_seals(stm32) -> None:
+def test_the_image_of_the_part_seals(stm32):
     """On the model of the STM32F405: its random numbers, its HMAC, a stranger."""
     from tests.models.stm32 import connect
 

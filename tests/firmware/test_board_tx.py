@@ -16,7 +16,7 @@ EXAMPLE = AIR["example_packet"]
 
 
 @pytest.fixture
-def example(tmp_path: Path) -> Path:
+def example(tmp_path):
     path = tmp_path / "symbols.json"
     path.write_text(json.dumps([EXAMPLE["symbols"]]))
     return path
@@ -25,7 +25,7 @@ def example(tmp_path: Path) -> Path:
 TWO_FRAMES = ("--set", "air.frames_per_packet=2")
 
 
-def test_chips_are_the_air_vectors(evlcp, example: Path, tmp_path: Path) -> None:
+def test_chips_are_the_air_vectors(evlcp, example, tmp_path):
     out = tmp_path / "chips.npy"
     well(evlcp("tx", "frames", example, "--chips", out, *TWO_FRAMES))
     chips = np.load(out)
@@ -34,7 +34,7 @@ def test_chips_are_the_air_vectors(evlcp, example: Path, tmp_path: Path) -> None
     assert [f"{int(''.join(map(str, row)), 2):04x}" for row in chips] == EXAMPLE["cluster_masks"]
 
 
-def test_every_form_has_the_same_words(evlcp, example: Path) -> None:
+def test_every_form_has_the_same_words(evlcp, example):
     table = json.loads(evlcp("tx", "frames", example, "--format", "json", *TWO_FRAMES).out)
     assert table["pilot_words"] == AIR["pilot_words"]
     info = [w for frame in table["info_words"][0] for w in frame]
@@ -61,14 +61,14 @@ def test_every_form_has_the_same_words(evlcp, example: Path) -> None:
         (json.dumps([[[0] * 15 + [64]] * 10]), "symbols[0][0][15] = 64, expected an integer 0 to 63"),
     ],
 )
-def test_wrong_symbols_are_one_line(evlcp, tmp_path: Path, text: str, expected: str) -> None:
+def test_wrong_symbols_are_one_line(evlcp, tmp_path, text, expected):
     path = tmp_path / "s.json"
     path.write_text(text)
     check_fault(evlcp("tx", "frames", path), 3, f"evlcp: {path}: ", expected)
 
 
 @pytest.mark.parametrize("digest", ['"00"', "5", "null"])
-def test_symbols_of_another_codebook_are_refused(evlcp, tmp_path: Path, digest: str) -> None:
+def test_symbols_of_another_codebook_are_refused(evlcp, tmp_path, digest):
     said, other = (evlcp("tx", "frames", "--random", 1, "--seed", n, "--format", "json").out for n in (0, 1))
     assert said != other
     path = tmp_path / "s.json"
@@ -80,7 +80,7 @@ def test_symbols_of_another_codebook_are_refused(evlcp, tmp_path: Path, digest: 
     check_fault(done, 8, f"{path}: codebook = {digest}", f"expected {own[:16]}")
 
 
-def test_wrong_masks_are_told(tmp_path: Path) -> None:
+def test_wrong_masks_are_told(tmp_path):
     path = tmp_path / "m.npy"
     for array, expected in (
         (np.zeros((345, 16), np.uint8), "whole packets of 346 chips"),
@@ -104,14 +104,14 @@ def test_wrong_masks_are_told(tmp_path: Path) -> None:
             read_masks(path, LINK)
 
 
-def test_codebook_packets_are_balanced_and_do_not_flicker(evlcp) -> None:
+def test_codebook_packets_are_balanced_and_do_not_flicker(evlcp):
     done = well(evlcp("tx", "check", "--random", 40, "--json"))
     rows = json.loads(done.out)["clusters"]
     assert len(rows) == 16
     assert all(r["on_share"] == 0.5 and r["longest_run"] == 2 and r["low_risk"] for r in rows)
 
 
-def test_flicker_of_known_waves() -> None:
+def test_flicker_of_known_waves():
     # a 100 Hz square wave of full modulation: its fundamental is 4/pi of the mean
     wave = np.tile(np.repeat([[1], [0]], 50, axis=0), (10, 1)).astype(np.uint8)
     row = flicker.check(wave, 10_000.0)[0]
@@ -127,7 +127,7 @@ def test_flicker_of_known_waves() -> None:
         assert flicker.check(np.full((100, 1), level, np.uint8), 10_000.0)[0].no_effect
 
 
-def test_a_flickering_payload_ends_with_one(evlcp) -> None:
+def test_a_flickering_payload_ends_with_one(evlcp):
     # at 300 chips/s the codes themselves are slow enough to see
     done = evlcp("tx", "check", "--random", 10, "--set", "air.chip_rate_hz=300.0")
     assert done.code == 1

@@ -3,7 +3,6 @@
 import contextlib
 import ctypes
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from board_lines import FatalLine, NoisyLine, board_link, board_on, deafen, some
 
 from evlcp_sdk.errors import InputError
 from firmware_host.board.bank import bank_of, symbol_chips
-from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.board import Settings, provision
 from firmware_host.board.update import Package, confirm, update, update_status
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import BoardError, IncompatibleError, LineError, RefusedError, VerifyError
@@ -20,19 +19,19 @@ from firmware_host.protocol.generated.requests import BoardFault, State, Status
 from tests.models.usb import UsbLine
 
 
-def package(seed: int, count: int = 400) -> Package:
-    def some(seed: int) -> bytes:
+def package(seed, count=400):
+    def some(seed):
         return np.random.default_rng(seed).integers(0, 256, count, np.uint8).tobytes()
 
     return Package("native", {1: some(seed), 2: some(seed + 100)})
 
 
-def image_of(device: SimulatedBoard, image: int, count: int) -> bytes:
+def image_of(device, image, count):
     """What stands in the place of image 1 or 2."""
     return ctypes.string_at(device.bench.images[image - 1], count)
 
 
-def resets(device: SimulatedBoard, count: int) -> list[int]:
+def resets(device, count):
     """Which image runs after each of so many resets."""
     found = []
     for _ in range(count):
@@ -41,11 +40,11 @@ def resets(device: SimulatedBoard, count: int) -> list[int]:
     return found
 
 
-def test_updates_take_turns_and_run_after_every_reset(device: SimulatedBoard, board: Board) -> None:
+def test_updates_take_turns_and_run_after_every_reset(device, board):
     assert device.bench.running == 0
     assert update_status(board).next == 1
     for n, image in enumerate((1, 2, 1, 2), 1):
-        told: list[tuple[int, int]] = []
+        told = []
         new = package(n, 3_001)
         done = update(board, new, lambda at, total, told=told: told.append((at, total)))
         assert (done.image, done.length, done.sequence) == (image, 3_001, n)
@@ -57,7 +56,7 @@ def test_updates_take_turns_and_run_after_every_reset(device: SimulatedBoard, bo
         board = board_on(device)
 
 
-def test_what_is_not_kept_is_left_at_the_third_reset(device: SimulatedBoard, board: Board) -> None:
+def test_what_is_not_kept_is_left_at_the_third_reset(device, board):
     # without one before, back to the one that was flashed
     update(board, package(1), keep=False)
     assert resets(device, 3)[-1] == 0
@@ -78,7 +77,7 @@ def test_what_is_not_kept_is_left_at_the_third_reset(device: SimulatedBoard, boa
 
 
 @pytest.mark.parametrize("before", [0, 1])
-def test_power_that_fails_at_every_step_leaves_one_of_the_two(before: int) -> None:
+def test_power_that_fails_at_every_step_leaves_one_of_the_two(before):
     """Words and erases of the flash, from the first of an update to its confirmation; the last ones all."""
     new = package(7)
     operations = 1 + 100 + 5 + 1 + 1  # erase, content, seal, try, confirmed
@@ -116,7 +115,7 @@ def test_power_that_fails_at_every_step_leaves_one_of_the_two(before: int) -> No
     assert ended["old"] >= len(moments) - 6
 
 
-def test_what_cannot_be_is_refused(device: SimulatedBoard, board: Board) -> None:
+def test_what_cannot_be_is_refused(device, board):
     with pytest.raises(IncompatibleError, match="is a native, the firmware is for stm32f405-8mhz"):
         update(board, Package("stm32f405-8mhz", {1: b"1234", 2: b"1234"}))
     with pytest.raises(RefusedError, match="65473 bytes of firmware, an image may have 65472"):
@@ -145,7 +144,7 @@ def test_what_cannot_be_is_refused(device: SimulatedBoard, board: Board) -> None
     assert board.status().state == State.PLAYING
 
 
-def test_what_is_interrupted_keeps_the_old_one_and_ends_well_later(device: SimulatedBoard) -> None:
+def test_what_is_interrupted_keeps_the_old_one_and_ends_well_later(device):
     noisy = NoisyLine(device, flips=2e-4, drops=0.0, doubles=0.0, seed=3)
     assert update(board_on(noisy, latency_s=0.01), package(4, 20_000)).image == device.bench.running == 1
     assert noisy.counts["flipped"] > 2
@@ -165,14 +164,14 @@ def test_what_is_interrupted_keeps_the_old_one_and_ends_well_later(device: Simul
 class SlowLine(UsbLine):
     """A line and a board that take two hundred times as long as they should."""
 
-    def now(self) -> float:
+    def now(self):
         return 200 * super().now()
 
-    def read(self, timeout_s: float) -> bytes:
+    def read(self, timeout_s):
         return super().read(timeout_s / 200)
 
 
-def test_a_slow_board_is_waited_for(device: SimulatedBoard) -> None:
+def test_a_slow_board_is_waited_for(device):
     board = board_on(SlowLine(device, 0.0), latency_s=0.1)
     done = update(board, package(3, 30_000))
     assert (done.image, device.bench.running) == (1, 1)
@@ -180,7 +179,7 @@ def test_a_slow_board_is_waited_for(device: SimulatedBoard) -> None:
     assert board.session.client.retries < 20
 
 
-def test_a_board_with_a_key_takes_updates_from_its_host_alone(device: SimulatedBoard, board: Board) -> None:
+def test_a_board_with_a_key_takes_updates_from_its_host_alone(device, board):
     key = bytes(range(16))
     provision(board, some_bank(), Settings(start=False))
     board.set_key(key)
@@ -191,7 +190,7 @@ def test_a_board_with_a_key_takes_updates_from_its_host_alone(device: SimulatedB
     assert update(board_on(device, key=key), package(1)).image == device.bench.running == 1
 
 
-def test_a_file_of_an_update(tmp_path: Path) -> None:
+def test_a_file_of_an_update(tmp_path):
     path = tmp_path / "a.update.json"
     path.write_text(package(1).to_json())
     assert Package.read(path) == package(1)
@@ -211,7 +210,7 @@ def test_a_file_of_an_update(tmp_path: Path) -> None:
 # -- the real images, on the model of the part
 
 
-def test_the_real_firmware_updates_itself(stm32, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_real_firmware_updates_itself(stm32, monkeypatch):
     from tests.models.stm32 import (
         RESET_BY_IWDG,
         RESET_BY_PIN,

@@ -8,14 +8,12 @@ import dataclasses
 import json
 import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from board_lines import board_link, some_bank
 
 from firmware_host.board import session
-from firmware_host.board.bank import Bank
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.emulators.simulated import SimulatedBoard
@@ -24,19 +22,18 @@ from firmware_host.ports.transport import ReplayTransport
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.datagram import DatagramDecoder
 from firmware_host.protocol.generated import requests
-from firmware_host.protocol.wire import WireMessage
 
 VECTORS = Path(__file__).parents[1] / "vectors"
 MESSAGES = [json.loads(line) for line in (VECTORS / "protocol-2.jsonl").read_text().splitlines()]
 
 
-def of(table: dict[str, Any]) -> type[WireMessage]:
+def of(table):
     name = "".join(word.capitalize() for word in f"{table['name']}_{table['kind']}".split("_"))
     return getattr(requests, name, requests.REPLIES[table["type"]])
 
 
 @pytest.mark.parametrize("table", MESSAGES, ids=lambda t: f"2.{t['minor']}-{t['name']}-{t['kind']}")
-def test_bytes_of_each_message_are_those_of_its_version(table: dict[str, Any]) -> None:
+def test_bytes_of_each_message_are_those_of_its_version(table):
     cls, wire = of(table), bytes.fromhex(table["hex"])
     assert cls is requests.REPLIES[table["type"]] or table["type"] == cls.TYPE
     message = cls.unpack(wire)
@@ -50,11 +47,11 @@ def test_bytes_of_each_message_are_those_of_its_version(table: dict[str, Any]) -
     assert not any(value.strip("0") if isinstance(value, str) else np.any(value) for value in later)
 
 
-def every_request(board: Board, bank: Bank, update: bytes) -> list[object]:
+def every_request(board, bank, update):
     """Say everything of protocol 2.0 once to a board that was just reset; what was answered."""
     call = board.session.call
     provision(board, bank, Settings(level_ma=11, start=False, level_limit_ma=40, duty_limit=0.75))
-    told: list[object] = [board.about.minor, board.verify(bank)]
+    told = [board.about.minor, board.verify(bank)]
     board.watchdog(requests.Watchdog.IDLE, 60_000)
     told += [board.save().slot, board.recall().slot]
     board.start()
@@ -81,12 +78,12 @@ def every_request(board: Board, bank: Bank, update: bytes) -> list[object]:
     return told
 
 
-def recorded(name: str) -> list[tuple[str, bytes]]:
+def recorded(name):
     lines = (VECTORS / name).read_text().splitlines()[1:]
     return [(e["dir"], bytes.fromhex(e["hex"])) for e in map(json.loads, lines)]
 
 
-def test_this_host_and_the_firmware_of_2_0(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_this_host_and_the_firmware_of_2_0(monkeypatch):
     monkeypatch.setattr(session, "MINOR", 1)  # what the host said that was recorded
     line = ReplayTransport(VECTORS / "board-2.0.jsonl")
     board = Board(Session(line, Timing(latency_s=2.0), first=line.first, nonce=line.nonce))
@@ -99,7 +96,7 @@ def test_this_host_and_the_firmware_of_2_0(monkeypatch: pytest.MonkeyPatch) -> N
     assert not line._events
 
 
-def test_the_host_of_2_0_and_this_firmware() -> None:
+def test_the_host_of_2_0_and_this_firmware():
     """It is answered as by its own firmware, as far as an answer does not tell the time."""
     device = SimulatedBoard((7).to_bytes(12, "big"))
     expected, wire, seen = b"", b"", set()
@@ -126,5 +123,5 @@ def test_the_host_of_2_0_and_this_firmware() -> None:
 LATER = requests.MINOR + 1
 
 
-def later(name: str, type_: str = "u32") -> dict[str, Any]:
+def later(name, type_="u32"):
     return {"name": name, "type": type_, "doc": "Of tomorrow.", "since": LATER}

@@ -18,17 +18,17 @@ from board_lines import (
 )
 
 from firmware_host.board.bank import Bank, bank_of
-from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.board import Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import BoardResetError, IncompatibleError, LineError, NoBoardError, RefusedError
 from firmware_host.protocol.generated import requests as protocol
 from firmware_host.protocol.generated.requests import MAJOR, MINOR, BoardFault, State, Watchdog
 
 
-def test_what_is_there_is_not_sent_again(board: Board) -> None:
+def test_what_is_there_is_not_sent_again(board):
     symbols = symbols_of(64)
     payload, half = bank_of(symbols, LINK), bank_of(symbols[:32], LINK)
-    seen: list[tuple[int, int]] = []
+    seen = []
     done = board.program(payload, progress=lambda a, b: seen.append((a, b)))
     assert (done.written, done.length, done.swapped, done.bank) == (20480, 20480, True, 0)
     assert (seen[0], seen[-1]) == ((0, 20480), (20480, 20480))
@@ -45,7 +45,7 @@ def test_what_is_there_is_not_sent_again(board: Board) -> None:
     assert board.program(bank_of(symbols, LINK)).written == 2048
 
 
-def test_hitless_swaps(device: SimulatedBoard, board: Board) -> None:
+def test_hitless_swaps(device, board):
     payloads = {f"p{n}": symbols_of(1 + n % 4, 100 + n) for n in range(12)}
     for n, symbols in enumerate(payloads.values()):
         provision(board, bank_of(symbols, LINK), Settings())
@@ -58,7 +58,7 @@ def test_hitless_swaps(device: SimulatedBoard, board: Board) -> None:
     assert check_order(sequence, {n: len(s) for n, s in payloads.items()}) == list(payloads)
 
 
-def test_programming_over_a_very_noisy_line(device: SimulatedBoard) -> None:
+def test_programming_over_a_very_noisy_line(device):
     board = board_on(NoisyLine(device, flips=2e-3, drops=0.01, doubles=0.01, seed=5))
     symbols = symbols_of(64, 6)
     payload = bank_of(symbols, LINK)
@@ -74,14 +74,14 @@ class HostDiedError(Exception):
     """The host died here."""
 
 
-def die(_: object) -> None:
+def die(_):
     raise HostDiedError
 
 
 OLD = symbols_of(2, 1)
 
 
-def playing() -> SimulatedBoard:
+def playing():
     """A board that plays OLD."""
     device = SimulatedBoard()
     provision(board_on(device), bank_of(OLD, LINK), Settings())
@@ -89,14 +89,14 @@ def playing() -> SimulatedBoard:
     return device
 
 
-def bytes_to_program(bank: Bank) -> int:
+def bytes_to_program(bank):
     """What goes to a board until it plays a bank; the same each time."""
     line = recording(playing())
     provision(board_on(line, nonce=7), bank, Settings())
     return len(line.written)
 
 
-def test_host_killed_at_any_moment() -> None:
+def test_host_killed_at_any_moment():
     new = symbols_of(24, 2)
     bank = bank_of(new, LINK)
     total = bytes_to_program(bank)
@@ -120,7 +120,7 @@ def test_host_killed_at_any_moment() -> None:
     assert min(ends.values()) > 1
 
 
-def test_board_reset_at_any_moment() -> None:
+def test_board_reset_at_any_moment():
     bank = some_bank(12, 2)
     told = []
     for moment in np.random.default_rng(8).integers(1, bytes_to_program(bank), 14):
@@ -141,7 +141,7 @@ def test_board_reset_at_any_moment() -> None:
     assert all("was reset" in words and "run the command again" in words for words in told)
 
 
-def test_silence_is_told(device: SimulatedBoard) -> None:
+def test_silence_is_told(device):
     line = SimulatedLine(device)
     board = board_on(line)
     deafen(line)
@@ -152,14 +152,14 @@ def test_silence_is_told(device: SimulatedBoard) -> None:
 
 
 @pytest.mark.parametrize(("major", "older"), [(MAJOR - 1, "host"), (MAJOR + 1, "firmware")])
-def test_another_major_version_is_incompatible(device, monkeypatch, major, older) -> None:
+def test_another_major_version_is_incompatible(device, monkeypatch, major, older):
     monkeypatch.setattr("firmware_host.board.session.MAJOR", major)
     words = rf"it speaks protocol {MAJOR}\.{MINOR}, this host .*; update the {older}"
     with pytest.raises(IncompatibleError, match=words):
         board_on(device)
 
 
-def test_save_survives_reset_and_damage(device: SimulatedBoard, board: Board) -> None:
+def test_save_survives_reset_and_damage(device, board):
     other = board_link(
         "modulation.id=ppm", "separation.id=edges", "decoding.id=edges", "air.chip_rate_hz=5000.0"
     )
@@ -193,7 +193,7 @@ def test_save_survives_reset_and_damage(device: SimulatedBoard, board: Board) ->
         board.save()
 
 
-def test_faults_show_and_darken_and_end_the_led_test(device: SimulatedBoard, board: Board) -> None:
+def test_faults_show_and_darken_and_end_the_led_test(device, board):
     provision(board, some_bank(), Settings())
     health = device.bench.health
     health.temperature_dc, health.faults, health.open_leds[-1] = 300, BoardFault.OPEN_LED, 1
@@ -219,7 +219,7 @@ def test_faults_show_and_darken_and_end_the_led_test(device: SimulatedBoard, boa
     assert state_of(board) == (State.PLAYING, 0)
 
 
-def test_a_packet_may_take_longer_than_ten_seconds(device: SimulatedBoard) -> None:
+def test_a_packet_may_take_longer_than_ten_seconds(device):
     board = board_on(SimulatedLine(device, step_us=5_000))
     # 400 frames at 1000 chips/s: 12.8 s
     link = board_link("air.frames_per_packet=400", "air.chip_rate_hz=1000.0")

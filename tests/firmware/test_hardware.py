@@ -14,7 +14,7 @@ PARTS = bar.parts()
 NETS = bar.nets(PARTS)
 
 
-def test_what_is_written_is_fresh() -> None:
+def test_what_is_written_is_fresh():
     made = bar.files(PARTS)
     assert sorted(made) == sorted(p.name for p in (ROOT / "docs" / "hardware").iterdir())
     for name, text in made.items():
@@ -22,7 +22,7 @@ def test_what_is_written_is_fresh() -> None:
         assert held == text, "python docs/figures/hardware.py --write"
 
 
-def test_the_page_has_the_figures_and_the_parts() -> None:
+def test_the_page_has_the_figures_and_the_parts():
     assert [row for row in bar.figures(PARTS) if f"| {row[0]} | {row[1]} |" not in PAGE] == []
     for value, _, count, price, refs in bar.bill(PARTS):
         row = rf"\| {re.escape(refs)} \| {re.escape(value)} \|.*\| {count} \| {price:.2f} \|"
@@ -30,7 +30,7 @@ def test_the_page_has_the_figures_and_the_parts() -> None:
     assert "Only modelled" in PAGE.splitlines()[2]
 
 
-def test_the_netlist_is_whole() -> None:
+def test_the_netlist_is_whole():
     refs = [p.ref for p in PARTS]
     assert len(refs) == len(set(refs))
     assert [net for net, pins in NETS.items() if len(pins) < 2] == []
@@ -46,7 +46,7 @@ def test_the_netlist_is_whole() -> None:
     assert across == {"U10"}
 
 
-def test_the_chain_lights_the_led_of_the_row() -> None:
+def test_the_chain_lights_the_led_of_the_row():
     """Shift 96 bits through the netlist, LED 0 first, as the firmware does."""
     parts = {p.ref: dict(p.pins.values()) for p in PARTS}
     drivers = {ref: pins for ref, pins in parts.items() if "SDI" in pins and "LE" in pins and "OUT0" in pins}
@@ -56,7 +56,7 @@ def test_the_chain_lights_the_led_of_the_row() -> None:
         net = drivers[ref]["SDO"]
     assert len(order) == 6
     row = np.random.default_rng(0).integers(0, 2, 96)
-    register: list[int] = [0] * 96
+    register = [0] * 96
     for bit in row.tolist():
         register = [bit, *register[:-1]]
     lit = {}
@@ -68,7 +68,7 @@ def test_the_chain_lights_the_led_of_the_row() -> None:
         assert parts[f"D{led + 1}"]["A"] == "+3V3_LED"
 
 
-def test_pins_are_those_of_the_firmware() -> None:
+def test_pins_are_those_of_the_firmware():
     (chip,) = (p for p in PARTS if p.ref == "U7")
     nets = dict(chip.pins.values())
     hal = (ROOT / "firmware_host" / "firmware" / "hal" / "stm32f405" / "hal.c").read_text()
@@ -86,7 +86,7 @@ def test_pins_are_those_of_the_firmware() -> None:
         assert tuple(nets[pin] for pin in pins.split()) == wanted
 
 
-def test_dark_without_the_firmware() -> None:
+def test_dark_without_the_firmware():
     """Each line that could light an LED is pulled to where it does not."""
     pulls = {}
     for part in PARTS:
@@ -100,7 +100,7 @@ def test_dark_without_the_firmware() -> None:
     assert bar.led_ma(0) == 0.0
 
 
-def test_currents_and_light_by_formula() -> None:
+def test_currents_and_light_by_formula():
     assert bar.led_ma(60) == pytest.approx(1e3 * 15 * 1.25 / 316, rel=1e-3)
     levels = [bar.led_ma(n) for n in range(61)]
     assert levels == sorted(levels)

@@ -1,7 +1,6 @@
 """A text from end to end: what the steps say and leave is what other readers find in their files."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from firmware_host.emulators.led_record import LedRecord
 from firmware_host.loop import _received
 
 
-def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path: Path) -> None:
+def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path):
     out = tmp_path / "out"
     done = well(
         evlcp("loop", "--text", "Grüße [b]", "--distance", "80", "--seed", "3", "--report", "-o", out)
@@ -46,7 +45,7 @@ def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path: Path
     assert evlcp("config", "-c", out / "link.toml", "--digest").out == evlcp("config", "--digest").out
 
 
-def test_a_text_that_does_not_arrive_ends_with_1(evlcp, tmp_path: Path) -> None:
+def test_a_text_that_does_not_arrive_ends_with_1(evlcp, tmp_path):
     done = evlcp("loop", "--distance", "900", "--set", "bar.rows=48", "--json", "-o", tmp_path)
     assert done.code == 1
     steps = [json.loads(line) for line in done.out.splitlines()]
@@ -58,7 +57,7 @@ def test_a_text_that_does_not_arrive_ends_with_1(evlcp, tmp_path: Path) -> None:
         assert all((tmp_path / name).is_file() for name in step["files"])
 
 
-def test_without_a_compiler(evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler(evlcp, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
     simulated._library.cache_clear()  # of tests before, which had one
@@ -67,7 +66,7 @@ def test_without_a_compiler(evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert done.err == "evlcp: cc is missing: apt-get install --no-install-recommends gcc libc6-dev make\n"
 
 
-def test_wrong_bits_are_said_of_a_light_without_a_distance_too() -> None:
+def test_wrong_bits_are_said_of_a_light_without_a_distance_too():
     step = {"result": "1 transmitter", "frames": 9, "frames_sent": 10, "bits": 72, "bit_errors": 36}
     said = "9 of 10 frames, 36 of 72 bits wrong (BER 0.5)"
     assert _received(step | {"distance_m": None}) == said

@@ -1,6 +1,6 @@
 """The laws themselves: a deliberately broken algorithm for each must fail it, and for the right reason."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +19,7 @@ from evlcp_wh.modulation import Wh8
 from evlcp_wh.pilots import WhPilots
 from evlcp_wh.separation import WhCorrelation
 
-from evlcp_sdk.air.codebook import Codebook, chips_of_values
+from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import ROLES, Ranging, Tracker
@@ -28,7 +28,7 @@ from evlcp_sdk.testing import LawError, laws_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
 from evlcp_sdk.testing.law import Subject
 from evlcp_sdk.testing.links import LINK
-from evlcp_sdk.values import PresenceMap, Range, SyncLock
+from evlcp_sdk.values import SyncLock
 
 Change = Callable[..., Any]
 
@@ -41,12 +41,12 @@ class Changed:
     method: str
     change: Change
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         found = getattr(self.inner, name)
         return (lambda *given: self.change(found(*given))) if name == self.method else found
 
 
-def compiled(inner: Any) -> Callable[[Change], Changed]:
+def compiled(inner):
     """What changes the function that an algorithm compiles to; `change(function) -> function`."""
     return lambda change: Changed(inner, "compile", change)
 
@@ -57,25 +57,25 @@ ranging = compiled(CentroidRanging())
 tracking = compiled(KalmanTracking())
 
 
-def after(change: Change) -> Change:
+def after(change):
     """Tamper with the result."""
     return lambda function: lambda *given: change(function(*given))
 
 
-def changed(**fields: Change) -> Change:
+def changed(**fields):
     """Tamper with fields of the result."""
 
-    def change(found: Any) -> Any:
+    def change(found):
         return replace(found, **{name: by(getattr(found, name)) for name, by in fields.items()})
 
     return after(change)
 
 
-def before(act: Change) -> Change:
+def before(act):
     """Do something to the inputs first."""
 
-    def tamper(function: Change) -> Change:
-        def call(*given: Any) -> Any:
+    def tamper(function):
+        def call(*given):
             act(*given)
             return function(*given)
 
@@ -94,7 +94,7 @@ class NoDefault(CentroidRanging):
 
 @dataclass
 class Thawed(Ranging):
-    def compile(self, *given: Any) -> Any:
+    def compile(self, *given):
         return CentroidRanging().compile(*given)
 
 
@@ -107,20 +107,20 @@ class MuteField(CentroidRanging):
 
 @dataclass(frozen=True)
 class Forgetful(CentroidRanging):
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         object.__setattr__(self, "min_clusters", self.min_clusters + 1)
 
 
 @dataclass(frozen=True)
 class Refusing(Ranging):
-    def compile(self, *given: Any) -> Any:
+    def compile(self, *given):
         raise ConfigError("a panel of 7 x 3 clusters only")
 
 
-def one_buffer(function: Change) -> Change:
-    kept: dict[str, PresenceMap] = {}
+def one_buffer(function):
+    kept = {}
 
-    def separate(sums: Any) -> PresenceMap:
+    def separate(sums):
         found = kept.setdefault("map", function(sums))
         new = function(sums)
         found.pixels[...] = new.pixels
@@ -132,7 +132,7 @@ def one_buffer(function: Change) -> Change:
 # Codes.
 
 
-def star(codes: Any) -> Any:
+def star(codes):
     """One code, and others that differ from it in one value."""
     out = np.ones((len(codes), 32), np.int8)
     out[np.arange(1, len(codes)), np.arange(1, len(codes))] = -1
@@ -153,20 +153,20 @@ class Stepping:
     inner: Any
     change: Change
 
-    def init(self) -> Any:
+    def init(self):
         return [self.inner.init(), b""]
 
-    def step(self, state: Any, *given: Any) -> Any:
+    def step(self, state, *given):
         return self.change(self.inner, state, *given)
 
-    def close(self, state: Any) -> Any:
+    def close(self, state):
         return state, self.inner.close(state[0])[1]
 
-    def counts(self, state: Any) -> Any:
+    def counts(self, state):
         return self.inner.counts(state[0])
 
 
-def stepping(inner: Any) -> Callable[[Change], Changed]:
+def stepping(inner):
     return lambda change: Changed(inner, "compile", lambda made: Stepping(made, change))
 
 
@@ -175,42 +175,42 @@ detection = stepping(Whole())
 framing = stepping(Uart())
 
 
-def giving(change: Change) -> Change:
+def giving(change):
     """A step whose results are changed."""
 
-    def step(inner: Any, state: Any, *given: Any) -> Any:
+    def step(inner, state, *given):
         then, found = inner.step(state[0], *given)
         return [then, state[1]], change(found)
 
     return step
 
 
-def mutating(inner: Any, state: Any, *given: Any) -> Any:
+def mutating(inner, state, *given):
     state[0], found = inner.step(state[0], *given)
     return state, found
 
 
-def locks_changed(change: Change) -> Any:
+def locks_changed(change):
     return sync(giving(lambda locks: [change(lock) for lock in locks]))
 
 
-def amnesic(inner: Any, state: Any, *given: Any) -> Any:
+def amnesic(inner, state, *given):
     return state, inner.step(inner.init(), *given)[1]
 
 
-def credulous(inner: Any, state: Any, t_us: Any, p: Any, until_us: int) -> Any:
+def credulous(inner, state, t_us, p, until_us):
     then, locks = inner.step(state[0], t_us, p, until_us)
     invented = [SyncLock(float(until_us), 100.0, 0.0, 0.0, 0.9)] if len(t_us) > 10 else []
     return [then, b""], [*locks, *invented]
 
 
-def grown(inner: Any, state: Any, start_us: int, events: Any) -> Any:
+def grown(inner, state, start_us, events):
     found, regions = inner.step(state[0], start_us, events)
     state[0] = replace(found, number=found.number + 1)
     return state, regions
 
 
-def forgetful_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any:
+def forgetful_framing(inner, state, events, until_us):
     """Every step but those of many events is forgotten."""
     if len(events) < 200:
         return state, []
@@ -218,7 +218,7 @@ def forgetful_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any
     return [found, b""], frames
 
 
-def growing_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any:
+def growing_framing(inner, state, events, until_us):
     found, frames = inner.step(state[0], events, until_us)
     return [found, state[1] + bytes(1 << 17)], frames
 
@@ -231,35 +231,35 @@ class Smoothing:
     nosy: bool = False
     off_m: float = 0.0
 
-    def init(self) -> Any:
+    def init(self):
         return {"at": None, "looked": 0}
 
-    def predict(self, state: Any, t_us: float) -> Any:
+    def predict(self, state, t_us):
         if self.nosy:
             state["looked"] += 1
         if state["at"] is None:
             return (np.zeros(1), 1.0) if self.early else None
         return state["at"], 1.0
 
-    def step(self, state: Any, t_us: float, value: Any, sigma: float) -> Any:
+    def step(self, state, t_us, value, sigma):
         at = value.copy() if state["at"] is None else state["at"] + 0.02 * (value - state["at"])
         at = at + state["looked"]
         return {"at": at, "looked": state["looked"]}, at + self.off_m, sigma
 
 
-def smoothing(**how: Any) -> Any:
-    return tracking(lambda _: Tracker(position=None, distance=Smoothing(**how)))  # type: ignore[arg-type]
+def smoothing(**how):
+    return tracking(lambda _: Tracker(position=None, distance=Smoothing(**how)))
 
 
 # Images.
 
 
-def without_events(found: PresenceMap) -> PresenceMap:
+def without_events(found):
     return found if found.selected.any() else replace(found, selected=~found.selected)
 
 
-def leaning(function: Change) -> Change:
-    def measure(view: Any) -> Range:
+def leaning(function):
+    def measure(view):
         rows = np.nonzero(view.presence.selected.any((0, 2)))[0]
         found = function(view)
         return replace(found, distance_m=found.distance_m * (1 + 0.01 * float(rows.mean())))
@@ -268,37 +268,37 @@ def leaning(function: Change) -> Change:
 
 
 class OneCamera(CentroidRanging):
-    def compile(self, camera: CameraModel, bar: Any, codebook: Any) -> Any:
+    def compile(self, camera, bar, codebook):
         return super().compile(CameraModel(), bar, codebook)
 
 
 class OneOrder(WhCorrelation):
-    def compile(self, codebook: Any) -> Any:
+    def compile(self, codebook):
         return super().compile(load_link().codebook)
 
 
 class TwoInputs(EdgeDecoding):
     """It is not told what stands around a codeword."""
 
-    def compile(self, codebook: Codebook) -> Any:
+    def compile(self, codebook):
         inner = super().compile(codebook)
         return lambda presence, sums: inner(presence, sums)
 
 
-def numbered(soft: Any) -> Any:
+def numbered(soft):
     return replace(soft, llr=soft.llr * np.arange(1, len(soft.llr) + 1, dtype=np.float32)[:, None])
 
 
 # Error correction.
 
 
-def code_changed(**change: Change) -> Any:
+def code_changed(**change):
     """A code whose ends are changed: its bits and coded bits, its LLRs and what is found."""
 
-    def by(name: str, value: Any) -> Any:
+    def by(name, value):
         return change[name](value) if name in change else value
 
-    def tamper(code: Any) -> Any:
+    def tamper(code):
         return SimpleNamespace(
             message_bits=code.message_bits,
             coded_bits=code.coded_bits,
@@ -309,10 +309,10 @@ def code_changed(**change: Change) -> Any:
     return Changed(Polar(), "compile", tamper)
 
 
-GULLIBLE: Change = lambda found: replace(found, ok=found.ok or found.flipped > 0)  # noqa: E731
+GULLIBLE = lambda found: replace(found, ok=found.ok or found.flipped > 0)  # noqa: E731
 """The check is not asked where some bits were put right."""
 
-BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
+BROKEN = {
     "form": [
         ("defaults", NoDefault(focus_m=1.0), "a default of field 'focus_m'"),
         ("frozen", Thawed(), "frozen=True"),
@@ -440,14 +440,14 @@ CASES = [
 
 
 @pytest.mark.parametrize(("role", "name", "algorithm", "said"), CASES)
-def test_the_law_finds_the_fault(role: str, name: str, algorithm: Any, said: str) -> None:
+def test_the_law_finds_the_fault(role, name, algorithm, said):
     law = next(law for law in laws_of(role) if law.name == name)
     with pytest.raises(LawError, match=said):
         law.hold(Subject(role, algorithm))
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_every_law_has_a_broken_algorithm(role: str) -> None:
+def test_every_law_has_a_broken_algorithm(role):
     of_form = {law.name for law in (*DESCRIPTION, *FUNCTION, *RESULT)}
     assert of_form <= {name for cases in BROKEN.values() for name, _, _ in cases}
     own = {law.name for law in laws_of(role)} - of_form - {law.name for law in LINK}

@@ -6,7 +6,7 @@ import pytest
 from numba import types
 
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.testing import Law, laws_of
+from evlcp_sdk.testing import laws_of
 from evlcp_sdk.testing.law import Subject, judge
 
 REGISTRY = Registry.load()
@@ -24,7 +24,7 @@ CASES = [
 ]
 
 
-def of_odd_arrays() -> set[tuple[str, str, str]]:
+def of_odd_arrays():
     """Versions of a kernel beside another one, for arrays that are read-only, or whose elements lie apart."""
     return {
         (module, name, str(args))
@@ -38,7 +38,7 @@ def of_odd_arrays() -> set[tuple[str, str, str]]:
 
 
 @pytest.mark.parametrize(("role", "id", "law"), CASES)
-def test_law(role: str, id: str, law: Law) -> None:
+def test_law(role, id, law):
     algorithm = REGISTRY.load_class(role, id)()
     before = of_odd_arrays()
     outcome = judge(law, Subject(role, algorithm), {})
@@ -52,7 +52,7 @@ def test_law(role: str, id: str, law: Law) -> None:
 
 
 @pytest.mark.parametrize(("role", "id"), sorted(DO_NOTHING))
-def test_what_does_nothing_is_passed_over(role: str, id: str) -> None:
+def test_what_does_nothing_is_passed_over(role, id):
     """By a law of its role at least; `test_law` sees to it that nothing else is."""
     subject = Subject(role, REGISTRY.load_class(role, id)())
     assert any(judge(law, subject, {}).status == "skipped" for law in laws_of(role))

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +12,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import ROLES, Ranging
 from evlcp_sdk.testing import LawError, check, conformance, laws_of, suite
-from evlcp_sdk.testing.law import Law, Subject, Verdict
+from evlcp_sdk.testing.law import Verdict
 from evlcp_sdk.testing.links import LINK
 
 Evlcp = Callable[..., Any]
@@ -23,27 +22,26 @@ Evlcp = Callable[..., Any]
 class Biased(CentroidRanging):
     """One percent too far."""
 
-    def compile(self, camera: Any, bar: Any, codebook: Any) -> Any:
+    def compile(self, camera, bar, codebook):
         measure = super().compile(camera, bar, codebook)
 
-        def biased(view: Any) -> Any:
+        def biased(view):
             found = measure(view)
             return replace(found, distance_m=1.01 * found.distance_m)
 
         return biased
 
 
-def exact(algorithm: Ranging, excuses: dict[str, str] | None = None) -> Callable[[], None]:
+def exact(algorithm, excuses=None):
     """The case of a law, of those that the decorator makes."""
-    name, cases = conformance("ranging", algorithm, excuses=excuses).mark.args  # type: ignore[attr-defined]
+    name, cases = conformance("ranging", algorithm, excuses=excuses).mark.args
     by_id = {case.id: case.values[0] for case in cases}
     assert name == "check"
     assert [*by_id] == [f"{type(algorithm).__name__}-{law.name}" for law in laws_of("ranging")]
-    held: Callable[[], None] = by_id[f"{type(algorithm).__name__}-exact"]
-    return held
+    return by_id[f"{type(algorithm).__name__}-exact"]
 
 
-def test_the_decorator_makes_one_test_a_law() -> None:
+def test_the_decorator_makes_one_test_a_law():
     """As the tests of the packages in examples/ use it."""
     exact(CentroidRanging())()
     with pytest.raises(
@@ -55,15 +53,15 @@ def test_the_decorator_makes_one_test_a_law() -> None:
     with pytest.raises(LawError, match=r"excused \(needless\), but it holds: drop the excuse"):
         exact(CentroidRanging(), {"exact": "needless"})()
     nothing = load_link(overrides=["tracking.id=none"]).algorithm("tracking")
-    cases = conformance("tracking", nothing, nothing).mark.args[1]  # type: ignore[attr-defined]
+    cases = conformance("tracking", nothing, nothing).mark.args[1]
     (line,) = (case for case in cases if case.id.endswith("-1-straight-line"))
     with pytest.raises(pytest.skip.Exception, match="leaves every quantity as measured"):
         line.values[0]()
 
 
-def test_what_is_refused_is_skipped_but_for_one_law() -> None:
+def test_what_is_refused_is_skipped_but_for_one_law():
     class Refusing(Ranging):
-        def compile(self, *given: Any) -> Any:
+        def compile(self, *given):
             raise ConfigError("a panel only")
 
     found = {o.law.name: o for o in check("ranging", Refusing(), {"exact": "because"})}
@@ -73,7 +71,7 @@ def test_what_is_refused_is_skipped_but_for_one_law() -> None:
     assert found["exact"].detail == "excused (because), but the law does not apply: refused: a panel only"
 
 
-def test_the_command_says_one_line_a_law(evlcp: Evlcp) -> None:
+def test_the_command_says_one_line_a_law(evlcp):
     done = evlcp("check", "ranging", "centroid", "--excuse", "exact=never mind")
     *lines, last = done.out.splitlines()
     assert done.code == 1
@@ -100,17 +98,17 @@ def test_the_command_says_one_line_a_law(evlcp: Evlcp) -> None:
         (("ranging", "poc", "--excuse", "exakt=no"), "no ranging law named 'exakt'"),
     ],
 )
-def test_what_is_unknown_ends_with_2(evlcp: Evlcp, given: tuple[str, ...], said: str) -> None:
+def test_what_is_unknown_ends_with_2(evlcp, given, said):
     done = evlcp("check", *given)
     assert done.code == 2
     assert said in done.err
     assert not done.out
 
 
-def test_a_whole_link(evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown: list[tuple[str, Law]] = []
+def test_a_whole_link(evlcp, monkeypatch):
+    shown = []
 
-    def hold(law: Law, subject: Subject, _: object) -> Verdict:
+    def hold(law, subject, _):
         shown.append((subject.role, law))
         bad = (subject.role, law.name) == ("decoding", "inverts")
         return Verdict(law, "failed" if bad else "ok", "symbol 3, got 4" if bad else "")
@@ -132,14 +130,14 @@ def test_a_whole_link(evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch) -> None:
 class Crashing(Ranging):
     """A stranger's ranging with a fault."""
 
-    def compile(self, camera: Any, bar: Any, codebook: Any) -> Any:
-        def measure(view: Any) -> Any:
+    def compile(self, camera, bar, codebook):
+        def measure(view):
             raise KeyError("cluster")
 
         return measure
 
 
-def test_a_fault_is_blamed_on_the_algorithm_under_test_and_where_it_was() -> None:
+def test_a_fault_is_blamed_on_the_algorithm_under_test_and_where_it_was():
     found = {o.law.name: o for o in check("ranging", Crashing())}
     for law in ("clean-link", "sparse-pilots"):
         assert found[law].status == "failed"
@@ -160,14 +158,14 @@ OTHER = (
 
 
 @pytest.mark.parametrize("role", ["pilots", "separation", "decoding", "ranging"])
-def test_the_defaults_keep_their_laws_on_another_link(role: str) -> None:
+def test_the_defaults_keep_their_laws_on_another_link(role):
     link = load_link(overrides=OTHER)
     for outcome in check(role, link.algorithms[role], link=link):
         refused = outcome.status == "skipped" and "leaves every quantity as measured" in outcome.detail
         assert outcome.status == "ok" or refused, f"{outcome.law.name}: {outcome.detail}"
 
 
-def test_a_law_sees_the_link_that_it_is_given() -> None:
+def test_a_law_sees_the_link_that_it_is_given():
     panel = load_link(
         overrides=["bar.rows=16", "bar.columns=16", "bar.cluster_rows=4", "bar.cluster_columns=4"]
     )
@@ -183,7 +181,7 @@ def test_a_law_sees_the_link_that_it_is_given() -> None:
     )
 
 
-def test_the_command_checks_on_any_link(evlcp: Evlcp, tmp_path: Path) -> None:
+def test_the_command_checks_on_any_link(evlcp, tmp_path):
     file = tmp_path / "link.toml"
     file.write_text("[bar]\nrows = 24\n[ranging]\nid = 'joint-scale'\nmin_boundaries = 3\n")
     # A name without a table, or with the role's, is a parameter of the algorithm; others are the link's.

@@ -24,31 +24,31 @@ ASKED = [
 ]
 
 
-def entries() -> list[str]:
+def entries():
     """One text a package: `name==version ; marker --hash=...`."""
     lines = "\n".join(line for line in LOCK.splitlines() if not line.startswith("#"))
     return lines.replace("\\\n", " ").splitlines()
 
 
-def requirement(entry: str) -> Requirement:
+def requirement(entry):
     return Requirement(entry.partition(" --hash=")[0])
 
 
-def packages() -> set[tuple[str, str]]:
+def packages():
     """Name and version of each."""
     found = map(requirement, entries())
     return {(canonicalize_name(one.name), str(one.specifier).removeprefix("==")) for one in found}
 
 
 @pytest.mark.parametrize("asked", ASKED)
-def test_what_the_project_asks_for_is_locked(asked: str) -> None:
+def test_what_the_project_asks_for_is_locked(asked):
     wanted = Requirement(asked)
     versions = [version for name, version in packages() if name == canonicalize_name(wanted.name)]
     assert versions, f"requirements-dev.lock lacks {wanted.name}"
     assert all(wanted.specifier.contains(version) for version in versions), (asked, versions)
 
 
-def test_every_package_is_pinned_by_version_and_hash() -> None:
+def test_every_package_is_pinned_by_version_and_hash():
     for entry in entries():
         (one,) = requirement(entry).specifier
         assert one.operator == "==", entry
@@ -57,11 +57,11 @@ def test_every_package_is_pinned_by_version_and_hash() -> None:
         assert all(re.fullmatch(r"sha256:[0-9a-f]{64}", h.strip()) for h in hashes), entry
 
 
-def test_the_lock_names_no_registry_and_no_machine() -> None:
+def test_the_lock_names_no_registry_and_no_machine():
     assert not re.search(r"://|index-url|find-links|^\s*-[a-z]|/[a-z]+/", LOCK)
 
 
-def test_the_sbom_names_every_package_of_the_lock() -> None:
+def test_the_sbom_names_every_package_of_the_lock():
     """`make sbom`, by its output: the lock's packages, no more and no less, the same each time."""
     command = [sys.executable, ROOT / ".ci" / "sbom.py"]
     said = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)]
@@ -82,19 +82,19 @@ def test_the_sbom_names_every_package_of_the_lock() -> None:
     assert "sbom:" in (ROOT / "Makefile").read_text()
 
 
-def test_citation_and_project_state_the_same_version_and_licence() -> None:
+def test_citation_and_project_state_the_same_version_and_licence():
     stated = dict(re.findall(r"^(version|license): (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE))
     assert stated == {"version": VERSION, "license": PROJECT["project"]["license"]}
 
 
-def test_make_has_a_rule_for_each_target_that_it_names() -> None:
+def test_make_has_a_rule_for_each_target_that_it_names():
     text = (ROOT / "Makefile").read_text()
     named = {name for line in re.findall(r"^\.PHONY: (.+)$", text, re.MULTILINE) for name in line.split()}
     assert {"demo", "test", "docs", "release"} <= named
     assert named <= set(re.findall(r"^([a-z]+):", text, re.MULTILINE))
 
 
-def test_the_changelog_begins_with_what_comes_next() -> None:
+def test_the_changelog_begins_with_what_comes_next():
     heads = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert heads[0] in ("Unreleased", VERSION)
     assert VERSION in heads[:2]

@@ -9,7 +9,6 @@ import sys
 import sysconfig
 import tomllib
 import venv
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,7 +22,7 @@ RECORDING = ROOT / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
 class Environment:
     """A fresh virtual environment that borrows all but the SDK from the one that runs the tests."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.folder = folder
         self.bin = folder / "venv" / "bin"
         venv.create(folder / "venv", with_pip=False, symlinks=True)
@@ -37,7 +36,7 @@ class Environment:
         self.site = folder / "venv" / "lib" / version / "site-packages"
         (self.site / "borrowed.pth").write_text(f"{borrowed}\n")
 
-    def run(self, *command: str | Path, code: int = 0, cwd: Path | None = None) -> str:
+    def run(self, *command, code=0, cwd=None):
         """What a command of the environment says; it must end with `code`.
 
         That it compiles kernels, which is said on stderr, is left out.
@@ -56,7 +55,7 @@ class Environment:
         said = [line for line in done.stderr.splitlines(keepends=True) if "compiling kernels" not in line]
         return done.stdout + "".join(said)
 
-    def build(self, project: Path) -> Path:
+    def build(self, project):
         """The wheel of a project."""
         wheels = self.folder / "wheels"
         before = set(wheels.glob("*.whl"))
@@ -64,12 +63,12 @@ class Environment:
         (wheel,) = set(wheels.glob("*.whl")) - before
         return wheel
 
-    def pip(self, verb: str, *rest: str | Path) -> str:
+    def pip(self, verb, *rest):
         """Run pip, which must not ask any index."""
         only = ("--no-deps", "--no-index") if verb != "uninstall" else ("-y",)
         return self.run("python", "-m", "pip", "-q", "--disable-pip-version-check", verb, *only, *rest)
 
-    def lend_kernels(self) -> None:
+    def lend_kernels(self):
         """Give it what is compiled already of modules that are the same: it takes that, and adds to it."""
         for source in ROOT.glob("*/**/_kernels.py"):
             folder = source.relative_to(ROOT)
@@ -82,13 +81,13 @@ class Environment:
                     (installed.parent / "__pycache__").mkdir(exist_ok=True)
                     shutil.copy(kernel, installed.parent / "__pycache__")
 
-    def plugins(self) -> dict[tuple[str, str], tuple[str, str]]:
+    def plugins(self):
         """(role, id) of each algorithm to its distribution and version."""
         rows = json.loads(self.run("evlcp", "plugins", "--json"))["algorithms"]
         return {(r["role"], r["id"]): (r["distribution"], r["version"]) for r in rows}
 
 
-def released(folder: Path) -> Path:
+def released(folder):
     """The SDK's wheel; that from its sdist is the same."""
     folder.mkdir()
     release = runpy.run_path(str(ROOT / ".ci" / "release.py"))
@@ -102,7 +101,7 @@ def released(folder: Path) -> Path:
 
 
 @pytest.fixture
-def environment(tmp_path: Path) -> Iterator[Environment]:
+def environment(tmp_path):
     """The environment with both wheels."""
     made = Environment(tmp_path)
     made.pip("install", released(tmp_path / "dist"), made.build(EXAMPLE), made.build(FORMATS))
@@ -112,7 +111,7 @@ def environment(tmp_path: Path) -> Iterator[Environment]:
     shutil.rmtree(made.folder)
 
 
-def the_wheels_are_imported_and_found(environment: Environment) -> None:
+def the_wheels_are_imported_and_found(environment):
     modules = ("evlcp_sdk", "evlcp_wh", "firmware_host", "evlcp_robust")
     code = f"import {', '.join(modules)}; print(*(m.__file__ for m in ({', '.join(modules)})), sep='\\n')"
     paths = environment.run("python", "-c", code).splitlines()
@@ -124,19 +123,19 @@ def the_wheels_are_imported_and_found(environment: Environment) -> None:
     assert plugins["decoding", "majority"] == ("evlcp-robust", "1.2.0")
 
 
-def its_algorithm_is_checked(environment: Environment) -> None:
+def its_algorithm_is_checked(environment):
     told = json.loads(environment.run("evlcp", "check", "ranging", "median-pairs", "--json"))
     assert (told["distribution"], told["version"]) == ("evlcp-robust", "1.2.0")
     assert {law["status"] for law in told["laws"]} == {"ok"}
 
 
-def its_own_tests_pass(environment: Environment, folder: Path) -> None:
+def its_own_tests_pass(environment, folder):
     said = environment.run("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=folder)
     assert " passed" in said
     assert "skipped" not in said
 
 
-def its_algorithms_and_its_format_are_used(environment: Environment) -> None:
+def its_algorithms_and_its_format_are_used(environment):
     out = environment.folder / "out"
     sets = ("ranging.id=median-pairs", "ranging.min_spacing=0.4", "decoding.id=majority")
     options = ("--sink", "distance-lines", *(x for s in sets for x in ("--set", s)))
@@ -156,7 +155,7 @@ def its_algorithms_and_its_format_are_used(environment: Environment) -> None:
     assert bar["rmse_m"] < 0.5
 
 
-def uninstalled_they_are_gone(environment: Environment) -> None:
+def uninstalled_they_are_gone(environment):
     environment.pip("uninstall", "evlcp-roadside", "evlcp-robust")
     out = environment.folder / "none"
     said = environment.run("evlcp", "receive", RECORDING, "-o", out, "--sink", "distance-lines", code=2)
@@ -167,7 +166,7 @@ def uninstalled_they_are_gone(environment: Environment) -> None:
     assert "no ranging algorithm named 'median-pairs'" in said
 
 
-def test_a_strangers_package_is_as_good_as_a_built_in(environment: Environment) -> None:
+def test_a_strangers_package_is_as_good_as_a_built_in(environment):
     """One test: to build the wheels and install them takes most of its time."""
     the_wheels_are_imported_and_found(environment)
     its_algorithm_is_checked(environment)

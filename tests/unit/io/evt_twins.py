@@ -17,11 +17,11 @@ class Decoded:
     early: int = 0  # steps back over a rollover
     last: int = 0
 
-    def lose(self, kind: str, at: int, count: int = 1) -> None:
+    def lose(self, kind, at, count=1):
         before, first = self.losses.get(kind, (0, at))
         self.losses[kind] = (before + count, first)
 
-    def add_event(self, t: int, x: int, y: int, p: int, at: int, width: int, height: int) -> None:
+    def add_event(self, t, x, y, p, at, width, height):
         if x >= width or y >= height:
             self.lose("outside_sensor", at)
         elif t < self.last:
@@ -30,7 +30,7 @@ class Decoded:
             self.last = t
             self.events.append((t, x, y, p))
 
-    def add_trigger(self, t: int, channel: int, value: int, at: int) -> None:
+    def add_trigger(self, t, channel, value, at):
         if t < self.last:
             self.lose("time_backward", at)
         else:
@@ -38,7 +38,7 @@ class Decoded:
             self.triggers.append((t, channel, value))
 
 
-def judged(words: list[int], k: int, bits: int, low_bits: int, before: int) -> str:
+def judged(words, k, bits, low_bits, before):
     """Whether TIME_HIGH words[k] is believed after `before`, `early` by little, or not believed."""
     ring, size = 1 << bits, (bits + 4) // 8
     ahead = (words[k] - before) % ring
@@ -52,7 +52,7 @@ def judged(words: list[int], k: int, bits: int, low_bits: int, before: int) -> s
     return "doubtful" if against > len(following) - against else "believed"
 
 
-def doubtful(out: Decoded, words: list[int], k: int, bits: int, low_bits: int, before: int, at: int) -> bool:
+def doubtful(out, words, k, bits, low_bits, before, at):
     """Count what TIME_HIGH words[k] is after `before`; whether it is not believed."""
     verdict, value = judged(words, k, bits, low_bits, before), words[k] % (1 << bits)
     if verdict != "believed":
@@ -62,7 +62,7 @@ def doubtful(out: Decoded, words: list[int], k: int, bits: int, low_bits: int, b
     return verdict == "doubtful"
 
 
-def decode_evt3(data: bytes, width: int, height: int, start: int = 0) -> Decoded:
+def decode_evt3(data, width, height, start=0):
     out = Decoded()
     high = row = base = None
     low = polarity = 0
@@ -126,7 +126,7 @@ def decode_evt3(data: bytes, width: int, height: int, start: int = 0) -> Decoded
     return out
 
 
-def decode_evt2(data: bytes, width: int, height: int, start: int = 0) -> Decoded:
+def decode_evt2(data, width, height, start=0):
     out = Decoded()
     high = None
     doubt = False

@@ -2,9 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import open_source, open_writer, read_events, write_events
 from evlcp_sdk.values import Events, Triggers
 from tests.conftest import ROOT
-from tests.unit.io.writers import Packet, packed, packed_ros1, write_mcap, write_ros1, write_sqlite
+from tests.unit.io.writers import packed, packed_ros1, write_mcap, write_ros1, write_sqlite
 
 BAGS = Path(__file__).parents[3].parent / "shared" / "recordings" / "bags"
 RECORDING = ROOT / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
@@ -31,7 +29,7 @@ shared = pytest.mark.skipif(not BAGS.is_dir(), reason="needs ../shared/recording
         ("bag:{}/trigger-db3", 82469, 2, 14224870, 15476187),
     ],
 )
-def test_bags_of_real_cameras(name: str, events: int, triggers: int, first_us: int, last_us: int) -> None:
+def test_bags_of_real_cameras(name, events, triggers, first_us, last_us):
     if "ros1" in name:
         pytest.importorskip("rosbags")
     with open_source(name.format(BAGS)) as source:
@@ -43,21 +41,21 @@ def test_bags_of_real_cameras(name: str, events: int, triggers: int, first_us: i
 
 
 @shared
-def test_another_codec_of_a_real_camera_is_refused() -> None:
+def test_another_codec_of_a_real_camera_is_refused():
     pytest.importorskip("mcap")
     with pytest.raises(InputError, match="packets of encoding 'libcaer_cmp', expected 'evt3'"):
         open_source(f"bag:{BAGS / 'libcaer-mcap'}")
 
 
 @pytest.fixture(scope="module")
-def packets() -> list[Packet]:
+def packets():
     """The recording that comes with the package, in 60 packets."""
     words = RECORDING.read_bytes().partition(b"% end\n")[2]
     size = len(words) // 120 * 2
     return list(enumerate(words[k : k + size] for k in range(0, len(words), size)))
 
 
-def same_as_the_recording(path: Path) -> Any:
+def same_as_the_recording(path):
     expected = read_events(RECORDING)
     with open_source(path) as source:
         got, _ = source.read()
@@ -68,7 +66,7 @@ def same_as_the_recording(path: Path) -> Any:
 
 
 @pytest.mark.parametrize("listed", [True, False])
-def test_files_of_a_folder_are_read_in_their_order(listed, packets, tmp_path) -> None:
+def test_files_of_a_folder_are_read_in_their_order(listed, packets, tmp_path):
     """Twelve: by their names, 10 would come before 2."""
     for n in range(12):
         messages = list(map(packed, packets[n * 6 : n * 6 + 6]))
@@ -88,7 +86,7 @@ def test_files_of_a_folder_are_read_in_their_order(listed, packets, tmp_path) ->
     ("write", "pack"), [(write_sqlite, packed), (write_mcap, packed), (write_ros1, packed_ros1)]
 )
 @pytest.mark.parametrize("how", ["one is 0", "jitter", "go round"])
-def test_packets_are_in_order_whatever_their_log_times(how, write, pack, packets, tmp_path) -> None:
+def test_packets_are_in_order_whatever_their_log_times(how, write, pack, packets, tmp_path):
     times = 10**9 + 10**7 * np.arange(len(packets))
     if how == "one is 0":
         times[30] = 0
@@ -102,13 +100,13 @@ def test_packets_are_in_order_whatever_their_log_times(how, write, pack, packets
 
 
 @pytest.mark.parametrize("how", ["one after the other", "a hundred later"])
-def test_packets_that_are_there_twice_are_left_out(how: str, packets: list[Packet], tmp_path: Path) -> None:
+def test_packets_that_are_there_twice_are_left_out(how, packets, tmp_path):
     both = [m for one in packets for m in (one, one)] if how.startswith("one") else packets * 2
     source = same_as_the_recording(write_sqlite(tmp_path / "a.db3", list(map(packed, both)), range(999)))
     assert source.counts["packets_twice"] == len(packets)
 
 
-def test_packets_that_are_missing_are_counted(packets: list[Packet], tmp_path: Path) -> None:
+def test_packets_that_are_missing_are_counted(packets, tmp_path):
     there = [packed(packet) for packet in packets if packet[0] not in (20, 21, 40)]
     with open_source(write_sqlite(tmp_path / "a.db3", there, range(99))) as source:
         source.read()
@@ -117,14 +115,14 @@ def test_packets_that_are_missing_are_counted(packets: list[Packet], tmp_path: P
     assert lost.first == pytest.approx(sum(len(words) for _, words in packets[:20]), abs=200)
 
 
-def test_a_driver_that_begins_anew(packets: list[Packet], tmp_path: Path) -> None:
+def test_a_driver_that_begins_anew(packets, tmp_path):
     """Numbers from 0 again, other words: what came before is given first, and nothing is missing."""
     again = [(n - 40, words) for n, words in packets[40:]]
     messages = [packed(one, order=">") for one in packets[:40] + again]
     same_as_the_recording(write_sqlite(tmp_path / "a.db3", messages, range(999)))
 
 
-def test_what_is_wrong_with_a_bag_is_said(tmp_path: Path) -> None:
+def test_what_is_wrong_with_a_bag_is_said(tmp_path):
     message = packed((0, np.array([0x8001, 0x6000, 0x0005, 0x2007], "<u2").tobytes()))
     write_sqlite(tmp_path / "two.db3", [message], [0], topics=2)
     write_sqlite(tmp_path / "none.db3", [], [], topics=0)
@@ -147,7 +145,7 @@ def test_what_is_wrong_with_a_bag_is_said(tmp_path: Path) -> None:
             open_source(f"bag:{tmp_path / name}")
 
 
-def test_a_bag_that_is_written_is_read_back(demo_raw, tmp_path, evlcp) -> None:
+def test_a_bag_that_is_written_is_read_back(demo_raw, tmp_path, evlcp):
     """By our reader; by `rosbags`, which knows ROS 2's own packing; and by `mcap`, word for word."""
     pytest.importorskip("mcap"), pytest.importorskip("rosbags")
     path = tmp_path / "a.mcap"
@@ -178,7 +176,7 @@ def test_a_bag_that_is_written_is_read_back(demo_raw, tmp_path, evlcp) -> None:
                 # What the file says its messages are, and not what we think.
                 text = schema.data.decode().split("=" * 80)[0]
                 store.register(get_types_from_msg(text, schema.name))
-            packet: Any = store.deserialize_cdr(message.data, schema.name)
+            packet = store.deserialize_cdr(message.data, schema.name)
             stamp = packet.header.stamp
             assert stamp.sec * 10**9 + stamp.nanosec == message.log_time
             assert (packet.encoding, packet.width, packet.height) == ("evt3", 1280, 720)
@@ -194,7 +192,7 @@ def test_a_bag_that_is_written_is_read_back(demo_raw, tmp_path, evlcp) -> None:
     assert (read_events(tmp_path / "back.raw").x == told.x).all()
 
 
-def test_a_command_that_converts_says_what_is_wrong(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+def test_a_command_that_converts_says_what_is_wrong(tmp_path, evlcp):
     raw, npz, cut = (tmp_path / name for name in ("a.raw", "a.npz", "cut.csv"))
     write_events(raw, Events.of(range(1200), range(1200), [5] * 1200, [1] * 1200), 1280, 720)
     cut.write_text("t_us,x,y,p\n1,2,3,1\n2,3,what,0\n")
@@ -211,7 +209,7 @@ def test_a_command_that_converts_says_what_is_wrong(tmp_path: Path, evlcp: Calla
     assert (tmp_path / "cut.raw").exists()
 
 
-def test_what_is_wrong_with_hdf5_is_said(tmp_path: Path) -> None:
+def test_what_is_wrong_with_hdf5_is_said(tmp_path):
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["images"] = file["other"] = np.zeros(3)

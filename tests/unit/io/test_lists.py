@@ -1,20 +1,16 @@
 """Tables of events as people and their tools write them, with places and without: the events are the same."""
 
 import gzip
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io import EventSource, open_source, read_events
+from evlcp_sdk.io import open_source, read_events
 from evlcp_sdk.io.columns import PIECE_ROWS
 from evlcp_sdk.io.fields import fields_of, time_unit
 from evlcp_sdk.values import Events
 from tests.unit.io.writers import (
-    Arrays,
     records,
     write_hdf5,
     write_mat,
@@ -32,7 +28,7 @@ X, Y = RNG.integers(300, 340, N), RNG.integers(200, 240, N)
 T_S, SIGNS, ROWS = T_US * 1e-6, P.astype(int) * 2 - 1, np.arange(N)
 
 
-def expect(name: Path | str, *, placed: bool) -> EventSource:
+def expect(name, *, placed):
     """The source, after it gave the events above."""
     with open_source(name) as source:
         events, _ = source.read()
@@ -46,7 +42,7 @@ def expect(name: Path | str, *, placed: bool) -> EventSource:
     return source
 
 
-def text(*columns: np.ndarray, head: str = "", mark: str = ",", form: str = "%s") -> str:
+def text(*columns, head="", mark=",", form="%s"):
     rows = [
         mark.join(form % c if isinstance(c, float) else str(c) for c in row)
         for row in zip(*columns, strict=True)
@@ -113,14 +109,14 @@ PLACED = {
 
 
 @pytest.mark.parametrize("name", LISTS | PLACED)
-def test_text(name: str, tmp_path: Path) -> None:
+def test_text(name, tmp_path):
     """The name of the file does not say that it is a table."""
     (tmp_path / "a.txt").write_text((LISTS | PLACED)[name])
     expect(tmp_path / "a.txt", placed=name in PLACED)
 
 
 @pytest.mark.parametrize("name", ["windows", "a line of units", "a title", "x,y,p,t without a header"])
-def test_files_of_text(name: str, tmp_path: Path) -> None:
+def test_files_of_text(name, tmp_path):
     content = (LISTS | PLACED)[name]
     for file, data in (
         ("a.csv", b"\xef\xbb\xbf" + content.encode()),
@@ -132,13 +128,13 @@ def test_files_of_text(name: str, tmp_path: Path) -> None:
         expect(tmp_path / file, placed=name in PLACED)
 
 
-def table(order: str, kind: Any = np.int64) -> np.ndarray:
+def table(order, kind=np.int64):
     columns = {"t": T_US, "x": X, "y": Y, "p": P, "s": T_S, "±": SIGNS}
     return np.stack([columns[name] for name in order], 1).astype(kind)
 
 
 LIST, ALL = {"t": T_US, "p": P}, {"t": T_US, "x": X, "y": Y, "p": P}
-ARRAYS: dict[str, Arrays] = {
+ARRAYS = {
     "a list": LIST,
     "a list of smaller types": {"t": T_US.astype(np.uint32), "p": P > 0},
     "a list in seconds": {"event_t": T_S, "event": P * 2.0 - 1.0},
@@ -183,7 +179,7 @@ WRITTEN = [
 
 
 @pytest.mark.parametrize(("file", "write", "name"), WRITTEN)
-def test_arrays(file: str, write: Callable[[Path, Arrays], None], name: str, tmp_path: Path) -> None:
+def test_arrays(file, write, name, tmp_path):
     arrays = {"events": TABLES[name]} if name in TABLES else ARRAYS[name]
     write(tmp_path / file, arrays)
     source = expect(
@@ -193,7 +189,7 @@ def test_arrays(file: str, write: Callable[[Path, Arrays], None], name: str, tmp
     assert source.width == (640 if write in (write_hdf5, write_records) else None)
 
 
-def test_two_arrays_without_names(tmp_path: Path) -> None:
+def test_two_arrays_without_names(tmp_path):
     np.savez(tmp_path / "a.npz", P, T_S)
     expect(tmp_path / "a.npz", placed=False)
     # As SciPy gives those of MATLAB: rows and columns of one.
@@ -201,7 +197,7 @@ def test_two_arrays_without_names(tmp_path: Path) -> None:
     expect(tmp_path / "b.npz", placed=False)
 
 
-def test_beside_a_table_stands_what_is_none(tmp_path: Path) -> None:
+def test_beside_a_table_stands_what_is_none(tmp_path):
     info, wide = np.array({"a": 1}, dtype=object), np.zeros((100, 4000), np.uint8)
     for other in (info, wide, np.zeros((90, 60), order="F")):
         np.savez(tmp_path / "a.npz", events=table("txyp"), img=other)
@@ -210,7 +206,7 @@ def test_beside_a_table_stands_what_is_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("on_its_side", [False, True])
 @pytest.mark.parametrize("order", ["txyp", "xypt", "ptyx"])
-def test_columns_of_an_hdf5_table_are_told(order: str, on_its_side: bool, tmp_path: Path) -> None:
+def test_columns_of_an_hdf5_table_are_told(order, on_its_side, tmp_path):
     path = tmp_path / "a.h5"
     write_hdf5(path, {"events": table(order).T if on_its_side else table(order)})
     expect(f"hdf5:{path}?columns={order}", placed=True)
@@ -224,7 +220,7 @@ def test_columns_of_an_hdf5_table_are_told(order: str, on_its_side: bool, tmp_pa
     ("factor", "unit", "form"),
     [(1e-6, "s", "%.6f"), (1e-3, "ms", "%.3f"), (1, "us", "%d"), (1000, "ns", "%d")],
 )
-def test_times_since_1970_say_their_unit(factor: float, unit: str, form: str, tmp_path: Path) -> None:
+def test_times_since_1970_say_their_unit(factor, unit, form, tmp_path):
     since_us = 1_600_000_000_000_000
     rows = [f"{form % ((since_us + int(t)) * factor)},{p}" for t, p in zip(T_US, P, strict=True)]
     (tmp_path / "a.csv").write_text("\n".join(["t,p", *rows]))
@@ -236,7 +232,7 @@ def test_times_since_1970_say_their_unit(factor: float, unit: str, form: str, tm
 
 @pytest.mark.parametrize(("many", "first_us"), [(1, 0), (40, 37_123_000), (1, 259_200_012_000)])
 @pytest.mark.parametrize("form", ["%.3f s", "%.6f s", "%.0f ms", "%.1f ms", "%.0f us", "%.0f ns"])
-def test_times_to_the_millisecond_say_their_unit(form: str, many: int, first_us: int, tmp_path: Path) -> None:
+def test_times_to_the_millisecond_say_their_unit(form, many, first_us, tmp_path):
     """Characters of eleven bits at 504 bit/s, a few events or many an edge: 4 s that would be 4 ms."""
     rng = np.random.default_rng(0)
     edges_us = np.cumsum(rng.integers(1, 4, 1000)) * 1e6 / 504
@@ -252,7 +248,7 @@ def test_times_to_the_millisecond_say_their_unit(form: str, many: int, first_us:
 
 
 @pytest.mark.parametrize(("digits", "words"), [(3, "1 ms"), (4, "100 us")])
-def test_rounded_times_are_said(digits: int, words: str, tmp_path: Path) -> None:
+def test_rounded_times_are_said(digits, words, tmp_path):
     (tmp_path / "a.csv").write_text(text(T_S, P, head="t,p", form=f"%.{digits}f"))
     with open_source(f"list:{tmp_path / 'a.csv'}?unit=s") as source:
         assert source.header["step"] == f"times are rounded to {words}"
@@ -261,7 +257,7 @@ def test_rounded_times_are_said(digits: int, words: str, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("suffix", ["csv", "npz"])
-def test_whole_milliseconds_of_many_pixels(suffix: str, tmp_path: Path) -> None:
+def test_whole_milliseconds_of_many_pixels(suffix, tmp_path):
     """More a second than any sensor gives, if they were microseconds."""
     t_ms, columns = np.sort(np.random.default_rng(3).integers(0, 8, 80_000)), {"x": X, "y": Y, "p": P}
     columns = {"t": t_ms} | {name: np.resize(column, 80_000) for name, column in columns.items()}
@@ -274,13 +270,13 @@ def test_whole_milliseconds_of_many_pixels(suffix: str, tmp_path: Path) -> None:
         assert "in ms, guessed" in source.header["time"]
 
 
-def test_times_coarser_than_a_chip_are_warned_of(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+def test_times_coarser_than_a_chip_are_warned_of(tmp_path, evlcp):
     (tmp_path / "a.csv").write_text(text(T_S, X, Y, P, head="t_s,x,y,p", form="%.3f"))
     done = evlcp("receive", tmp_path / "a.csv", "-o", tmp_path / "out")
     assert "times come in steps of 1 ms; a chip is 0.1 ms" in " ".join(done.out.split())
 
 
-def test_a_light_that_blinks_in_another_unit_than_named_is_said(tmp_path: Path) -> None:
+def test_a_light_that_blinks_in_another_unit_than_named_is_said(tmp_path):
     t_us = np.arange(80_000) // 1000 * 100 + np.arange(80_000) % 1000 // 50
     for unit, said in (("ns", "in us a light would blink"), ("us", "")):
         lines = [f"{t},{t % 2}" for t in t_us.tolist()]
@@ -292,7 +288,7 @@ def test_a_light_that_blinks_in_another_unit_than_named_is_said(tmp_path: Path) 
 
 @pytest.mark.parametrize("before_us", [200, 7000])
 @pytest.mark.parametrize("end", [1 << 32, 1 << 31, 1 << 24], ids=["uint32", "int32", "24 bits"])
-def test_counters_go_round(end: int, before_us: int, tmp_path: Path) -> None:
+def test_counters_go_round(end, before_us, tmp_path):
     """Within the rows by which the unit is known, and beyond."""
     n = 80_000
     # A light that blinks at 10 kHz, as the unit is by that.
@@ -314,7 +310,7 @@ def test_counters_go_round(end: int, before_us: int, tmp_path: Path) -> None:
         assert source.guessed.endswith("the counter of times went round")
 
 
-def test_a_clock_that_restarts_at_a_piece_has_not_gone_round(tmp_path: Path) -> None:
+def test_a_clock_that_restarts_at_a_piece_has_not_gone_round(tmp_path):
     """However much was counted before: a counter of 24 bits never had that."""
     n = PIECE_ROWS
     t = np.concatenate([3_000_000_000 + 100 * np.arange(n), 100 * np.arange(n)])
@@ -324,7 +320,7 @@ def test_a_clock_that_restarts_at_a_piece_has_not_gone_round(tmp_path: Path) -> 
     assert "times_gone_round" not in source.counts
 
 
-def test_late_rows_are_sorted_in(tmp_path: Path) -> None:
+def test_late_rows_are_sorted_in(tmp_path):
     order = np.argsort(T_US + np.random.default_rng(3).integers(0, 5000, N), kind="stable")
     late = {"t_us": T_US[order], "x": X[order], "y": Y[order], "p": P[order]}
     write_npz(tmp_path / "a.npz", late)
@@ -334,7 +330,7 @@ def test_late_rows_are_sorted_in(tmp_path: Path) -> None:
         assert expect(tmp_path / name, placed=True).counts["rows_out_of_order"] > 1000
 
 
-def test_rows_that_are_no_number_are_dropped_and_counted(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+def test_rows_that_are_no_number_are_dropped_and_counted(tmp_path, evlcp):
     """Some of a long table; and where they are more than a hundredth, the result is no whole one."""
     t_us = np.arange(50_000) * 7001
     rows = text(t_us * 1.0, t_us % 640, t_us % 480, t_us % 2, head="t_us,x,y,p").splitlines()
@@ -356,7 +352,7 @@ def test_rows_that_are_no_number_are_dropped_and_counted(tmp_path: Path, evlcp: 
     assert "150 events or words, 5.0%, were dropped" in " ".join((done.out + done.err).split())
 
 
-def test_what_a_list_does_not_say_is_told(tmp_path: Path) -> None:
+def test_what_a_list_does_not_say_is_told(tmp_path):
     (tmp_path / "a.csv").write_text(text(ROWS % 7, SIGNS, T_US))
     events = read_events(f"list:{tmp_path / 'a.csv'}?columns=-,p,t&unit=ms&inverted=1")
     np.testing.assert_array_equal(events.t_us, T_US * 1000)
@@ -370,12 +366,12 @@ def test_what_a_list_does_not_say_is_told(tmp_path: Path) -> None:
             read_events(f"list:{tmp_path / 'a.csv'}{options}")
 
 
-def test_a_last_line_that_is_cut_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_a_last_line_that_is_cut_is_left_out_and_counted(tmp_path):
     (tmp_path / "a.csv").write_text(LISTS["us"] + "413")
     assert expect(tmp_path / "a.csv", placed=False).counts["rows_cut"] == 1
 
 
-def test_names_that_do_not_tell() -> None:
+def test_names_that_do_not_tell():
     assert fields_of(["t", "x", "y"]) is None
     assert fields_of(["t_frame", "p"]) is None
     fields = fields_of(["timestamp_ms", "t", "sign", "p"])
@@ -392,5 +388,5 @@ def test_names_that_do_not_tell() -> None:
         (np.array([0.5, 1e7 + 0.25, 2e7 + 0.125]), "us"),
     ],
 )
-def test_few_times_say_their_unit(times: np.ndarray, unit: str) -> None:
+def test_few_times_say_their_unit(times, unit):
     assert time_unit(times, None).name == unit

@@ -2,9 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,14 +20,14 @@ EVENTS = Events.of(np.arange(50) * 10, np.arange(50), np.arange(50), np.ones(50)
 class CameraSource(EventSource):
     """A camera of a stranger's package: fifty events, then it is unplugged."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(Path("cam:0"), "CAMERA", 1280, 720)
         self.left = [(EVENTS, Triggers.empty())]
 
-    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
+    def take(self, max_events):
         return self.left.pop() if self.left else None
 
-    def close(self) -> None:
+    def close(self):
         pass
 
 
@@ -37,7 +35,7 @@ class Camera:
     """Opens that camera, and files that the SDK's own plugin would take; writes nothing well."""
 
     @hookimpl
-    def evlcp_open_events(self, url: str) -> Any:
+    def evlcp_open_events(self, url):
         if url == "cam:broken":
             raise KeyError("no such device")
         if url == "cam:none":
@@ -47,21 +45,21 @@ class Camera:
         return CameraSource() if url.startswith("cam:") or url.endswith(".dat") else None
 
     @hookimpl
-    def evlcp_open_writer(self, path: Path) -> Any:
+    def evlcp_open_writer(self, path):
         if path.suffix == ".bad":
             raise KeyError("no room")
         return Events.empty() if path.suffix == ".odd" else None
 
 
 @pytest.fixture
-def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+def installed(monkeypatch):
     """The camera's plugin, as if its package were installed."""
     load = Registry.load
     monkeypatch.setattr(Registry, "load", lambda *plugins: load(Camera(), *plugins))
 
 
 @pytest.mark.usefixtures("installed")
-def test_the_command_line_sees_it(evlcp: Callable[..., Any], tmp_path: Path) -> None:
+def test_the_command_line_sees_it(evlcp, tmp_path):
     assert json.loads(evlcp("info", "cam:0", "--json").out)["counts"]["events"] == 50
     assert evlcp("receive", "cam:0", "-o", tmp_path / "out").code == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -77,7 +75,7 @@ def test_the_command_line_sees_it(evlcp: Callable[..., Any], tmp_path: Path) -> 
         *(("run:7.raw", "run:7.raw"), ("-", "file:-"), ("camera:", "file:camera:"), ("tcp:x", "file:tcp:x")),
     ],
 )
-def test_names_of_files(file: str, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_of_files(file, url, tmp_path, monkeypatch):
     """What plugins leave goes to the readers; after `file:` stands a file's name, whatever it looks like."""
     monkeypatch.chdir(tmp_path)
     write_events(tmp_path / "first.raw", EVENTS, 1280, 720)
@@ -85,7 +83,7 @@ def test_names_of_files(file: str, url: str, tmp_path: Path, monkeypatch: pytest
     assert len(read_events(url.format(tmp_path))) == 50
 
 
-def test_an_unknown_scheme_is_one_line(evlcp: Callable[..., Any]) -> None:
+def test_an_unknown_scheme_is_one_line(evlcp):
     done = evlcp("info", "cam:0")
     assert done.code == 3
     assert done.err.startswith("evlcp: cam:0: scheme 'cam', expected file:, replay:, ")
@@ -103,7 +101,7 @@ def test_an_unknown_scheme_is_one_line(evlcp: Callable[..., Any]) -> None:
         ("cam:file", "evlcp_open_events('cam:file') gave PosixPath, expected an EventSource"),
     ],
 )
-def test_a_plugin_that_fails_is_named(url: str, reason: str, evlcp: Callable[..., Any]) -> None:
+def test_a_plugin_that_fails_is_named(url, reason, evlcp):
     with pytest.warns(PluginWarning, match=re.escape(reason)), pytest.raises(InputError) as fault:
         open_source(url)
     assert str(fault.value).startswith(f"{url}: scheme 'cam', expected file:")
@@ -114,12 +112,12 @@ def test_a_plugin_that_fails_is_named(url: str, reason: str, evlcp: Callable[...
     assert "Traceback" not in done.err
 
 
-def test_a_camera_that_is_not_there_says_so() -> None:
+def test_a_camera_that_is_not_there_says_so():
     with pytest.raises(InputError, match=r"^cam:none: no camera is plugged in$"):
         open_source("cam:none", Registry.load(Camera()))
 
 
-def test_what_is_a_recording_waits_for_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_a_recording_waits_for_its_reader(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "0").touch()
     for name in ("a.raw", "file:a.raw", "replay:a.raw", "list:a.csv?unit=ms", "bag:none.mcap", "HDF5:a"):
@@ -128,7 +126,7 @@ def test_what_is_a_recording_waits_for_its_reader(tmp_path: Path, monkeypatch: p
         assert not is_recording(name), name
 
 
-def test_a_strangers_plugin_comes_before_the_formats_of_ours(tmp_path: Path) -> None:
+def test_a_strangers_plugin_comes_before_the_formats_of_ours(tmp_path):
     (tmp_path / "x.dat").write_bytes(bytes(64))
     with open_source(tmp_path / "x.dat", Registry.load(Camera())) as source:
         assert isinstance(source, CameraSource)
@@ -138,7 +136,7 @@ def test_a_strangers_plugin_comes_before_the_formats_of_ours(tmp_path: Path) -> 
     ("suffix", "reason"),
     [("bad", "fails: KeyError: 'no room'"), ("odd", "gave Events, expected an EventWriter")],
 )
-def test_a_writer_that_cannot_be_used_is_named(tmp_path: Path, suffix: str, reason: str) -> None:
+def test_a_writer_that_cannot_be_used_is_named(tmp_path, suffix, reason):
     registry = Registry.load(Camera())
     with (
         pytest.warns(PluginWarning, match=re.escape(reason)),
@@ -147,7 +145,7 @@ def test_a_writer_that_cannot_be_used_is_named(tmp_path: Path, suffix: str, reas
         open_writer(tmp_path / f"a.{suffix}", 8, 8, registry=registry)
 
 
-def test_a_bad_bag_leaves_its_reader_in(tmp_path: Path) -> None:
+def test_a_bad_bag_leaves_its_reader_in(tmp_path):
     registry = Registry.load()
     (tmp_path / "bag" / "a.mcap").mkdir(parents=True)
     for _ in range(2):

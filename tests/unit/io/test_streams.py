@@ -4,9 +4,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,17 +18,17 @@ EVENTS = Events.of(np.arange(3000) * 7, np.arange(3000) % 640, np.arange(3000) %
 
 
 @pytest.fixture(params=["EVT2", "EVT3"])
-def recording(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+def recording(request, tmp_path):
     path = tmp_path / f"{request.param}.raw"
     write_events(path, EVENTS, 640, 480, format=request.param)
     return path
 
 
 @contextmanager
-def sent(listening: socket.socket, data: bytes) -> Iterator[None]:
+def sent(listening, data):
     """One who connects is sent some bytes, in odd pieces."""
 
-    def send() -> None:
+    def send():
         connection, _ = listening.accept()
         with connection:
             for at in range(0, len(data), 1001):
@@ -43,12 +41,12 @@ def sent(listening: socket.socket, data: bytes) -> Iterator[None]:
         thread.join(5)
 
 
-def same(events: Events) -> bool:
+def same(events):
     return all((getattr(events, name) == getattr(EVENTS, name)).all() for name in ("t_us", "x", "y", "p"))
 
 
 @pytest.mark.parametrize("how", ["tcp", "unix", "without a header"])
-def test_a_stream_gives_what_is_in_the_file(how: str, recording: Path, tmp_path: Path) -> None:
+def test_a_stream_gives_what_is_in_the_file(how, recording, tmp_path):
     data = recording.read_bytes()
     if how == "unix":
         listening, url = socket.socket(socket.AF_UNIX), f"unix:{tmp_path / 's'}"
@@ -66,13 +64,13 @@ def test_a_stream_gives_what_is_in_the_file(how: str, recording: Path, tmp_path:
         assert source.losses == {}
 
 
-def test_datagrams_are_read_as_they_come(recording: Path) -> None:
+def test_datagrams_are_read_as_they_come(recording):
     header, _, words = recording.read_bytes().partition(b"% end\n")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
 
-    def send() -> None:
+    def send():
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.connect(("localhost", port))
             # The second is refused as long as nobody listened for the first.
@@ -101,7 +99,7 @@ def test_datagrams_are_read_as_they_come(recording: Path) -> None:
     assert same(got)
 
 
-def test_a_read_ends_when_the_source_is_closed(recording: Path) -> None:
+def test_a_read_ends_when_the_source_is_closed(recording):
     ours, theirs = socket.socketpair()
     theirs.sendall(recording.read_bytes())
     with ours, theirs, StreamSource("a", file=SocketBytes(ours)) as source:
@@ -128,14 +126,14 @@ def test_a_read_ends_when_the_source_is_closed(recording: Path) -> None:
         ("tcp://localhost:1?size=big", "size = 'big': expected WIDTHxHEIGHT"),
     ],
 )
-def test_what_is_wrong_with_a_stream_is_said(url: str, told: str) -> None:
+def test_what_is_wrong_with_a_stream_is_said(url, told):
     with pytest.raises(InputError) as fault:
         open_source(url)
     assert str(fault.value).startswith(url)
     assert told in str(fault.value)
 
 
-def test_a_pipe_in_the_dark_is_opened_at_once(recording: Path) -> None:
+def test_a_pipe_in_the_dark_is_opened_at_once(recording):
     """The header is enough; events come when there are any."""
     end, start = os.pipe()
     header, mark, words = recording.read_bytes().partition(b"% end\n")
@@ -148,7 +146,7 @@ def test_a_pipe_in_the_dark_is_opened_at_once(recording: Path) -> None:
     os.close(end)
 
 
-def test_a_loop_goes_on_with_its_clock(tmp_path: Path) -> None:
+def test_a_loop_goes_on_with_its_clock(tmp_path):
     table = {"t_us": [1000, 2000, 3000, 4000], "x": [1, 2, 700, 3], "y": [0] * 4, "p": [1] * 4}
     edge = {"trigger_t_us": [4500], "trigger_channel": [1], "trigger_value": [1]}
     np.savez(tmp_path / "a.npz", width=640, height=480, **table, **edge)

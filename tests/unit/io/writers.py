@@ -2,9 +2,7 @@
 
 import sqlite3
 import struct
-from collections.abc import Iterable
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,20 +10,20 @@ import pytest
 Arrays = dict[str, np.ndarray]
 
 
-def records(**columns: np.ndarray) -> np.ndarray:
+def records(**columns):
     return np.rec.fromarrays(list(columns.values()), names=list(columns))
 
 
-def write_npz(path: Path, arrays: Arrays) -> None:
+def write_npz(path, arrays):
     np.savez_compressed(path, allow_pickle=True, **arrays)
 
 
-def write_npy(path: Path, arrays: Arrays) -> None:
+def write_npy(path, arrays):
     (array,) = arrays.values()
     np.save(path, array)
 
 
-def write_mat(path: Path, arrays: Arrays) -> None:
+def write_mat(path, arrays):
     """Records become a structure of arrays, beside which stands something else."""
     from scipy.io import savemat
 
@@ -36,7 +34,7 @@ def write_mat(path: Path, arrays: Arrays) -> None:
     savemat(path, {**named, "note": "30 m"}, do_compression=True)
 
 
-def write_hdf5(path: Path, arrays: Arrays) -> None:
+def write_hdf5(path, arrays):
     h5py = pytest.importorskip("h5py")
     with h5py.File(path, "w") as file:
         for name, column in arrays.items():
@@ -45,11 +43,11 @@ def write_hdf5(path: Path, arrays: Arrays) -> None:
         file.attrs["width"], file.attrs["height"] = 640, 480
 
 
-def write_records(path: Path, arrays: Arrays) -> None:
+def write_records(path, arrays):
     write_hdf5(path, {"CD/events": records(**arrays)})
 
 
-def write_mat_73(path: Path, arrays: Arrays) -> None:
+def write_mat_73(path, arrays):
     h5py = pytest.importorskip("h5py")
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, column in arrays.items():
@@ -67,7 +65,7 @@ DEFINITION = (
 )
 
 
-def packed(packet: Packet, order: str = "<") -> bytes:
+def packed(packet, order="<"):
     """A message of ROS 2, by hand: every field at a multiple of its size."""
     seq, words = packet
     head = struct.pack(f"{order}iII4sIIQQ", 1, 2, 4, b"cam\0", 720, 1280, seq, 0)
@@ -75,14 +73,14 @@ def packed(packet: Packet, order: str = "<") -> bytes:
     return (b"\0\1\0\0" if order == "<" else b"\0\0\0\0") + head + tail + words
 
 
-def packed_ros1(packet: Packet) -> bytes:
+def packed_ros1(packet):
     """A message of ROS 1: nothing stands between fields, and the header has a number of its own."""
     seq, words = packet
     head = struct.pack("<IIII3sIIQQ", 0, 1, 2, 3, b"cam", 720, 1280, seq, 0)
     return head + struct.pack("<I4sBI", 4, b"evt3", 0, len(words)) + words
 
 
-def write_sqlite(path: Path, messages: list[bytes], times: Iterable[int], topics: int = 1) -> Path:
+def write_sqlite(path, messages, times, topics=1):
     with closing(sqlite3.connect(path)) as base, base:
         base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT)")
         base.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB)")
@@ -93,7 +91,7 @@ def write_sqlite(path: Path, messages: list[bytes], times: Iterable[int], topics
     return path
 
 
-def write_mcap(path: Path, messages: list[bytes], times: Iterable[int]) -> None:
+def write_mcap(path, messages, times):
     writer = pytest.importorskip("mcap.writer")
     with path.open("wb") as file:
         made = writer.Writer(file, chunk_size=200_000)
@@ -104,7 +102,7 @@ def write_mcap(path: Path, messages: list[bytes], times: Iterable[int]) -> None:
         made.finish()
 
 
-def write_ros1(path: Path, messages: list[bytes], times: Iterable[int]) -> None:
+def write_ros1(path, messages, times):
     rosbag1 = pytest.importorskip("rosbags.rosbag1")
     typesys = pytest.importorskip("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC)

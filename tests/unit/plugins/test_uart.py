@@ -5,16 +5,11 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Callable
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from evlcp_uart import _kernels
-from evlcp_uart.characters import Parity
-from evlcp_uart.decoder import Character
 from evlcp_uart.framing import Uart, read_characters
 from evlcp_uart.inference import infer
 from evlcp_uart.light import TICKS
@@ -25,19 +20,17 @@ from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.diagnosis.tallies import RunTally
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.compose import compose
-from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.recordings import merged
-from evlcp_sdk.values import Events, Packet
+from evlcp_sdk.values import Events
 from tests.conftest import ROOT
 
 BAR = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
 BIT_504_US = 1e6 / 504
 
 
-def levels_of(
-    values: np.ndarray, data_bits: int, parity: Parity, stop_bits: int, highest_first: bool = False
-) -> list[int]:
+def levels_of(values, data_bits, parity, stop_bits, highest_first=False):
     """Bits on air of characters, by the textbook, or the highest bit first as home-made transmitters send."""
     out = []
     for value in values.tolist():
@@ -49,18 +42,18 @@ def levels_of(
 
 
 def seen(
-    rng: np.random.Generator,
-    levels: list[int],
-    bit_us: float,
+    rng,
+    levels,
+    bit_us,
     *,
-    mark_on: bool = True,
-    events: tuple[float, float] = (80.0, 50.0),
-    late_us: tuple[float, float] = (60.0, 110.0),
-    noise_hz: float = 300.0,
-    unseen: float = 0.0,
-    start_us: float = 20_000.0,
-    cut_bits: float = 0.0,
-) -> Events:
+    mark_on=True,
+    events=(80.0, 50.0),
+    late_us=(60.0, 110.0),
+    noise_hz=300.0,
+    unseen=0.0,
+    start_us=20_000.0,
+    cut_bits=0.0,
+):
     """What pixels make of the edges: Poisson bursts, log-normally late, noise, edges without a burst."""
     times, polarities = [], []
     before = 1
@@ -83,7 +76,7 @@ def seen(
     return merged(Events.of(np.floor(t[kept]), np.zeros(n), np.zeros(n), p[kept]))
 
 
-def wrong_bits(found: list[int], sent: list[int], data_bits: int) -> float:
+def wrong_bits(found, sent, data_bits):
     return sum((a ^ b).bit_count() for a, b in zip(found, sent, strict=True)) / (data_bits * len(sent))
 
 
@@ -96,7 +89,7 @@ def wrong_bits(found: list[int], sent: list[int], data_bits: int) -> float:
         (10_000.0, -0.01, True, (40.0, 60.0)),
     ],
 )
-def test_bright_light_is_read_without_an_error(bit_hz, clock, mark_on, late_us) -> None:
+def test_bright_light_is_read_without_an_error(bit_hz, clock, mark_on, late_us):
     rng = np.random.default_rng(3)
     sent = rng.integers(0, 128, 60)
     bit_us = 1e6 / bit_hz * (1 + clock)
@@ -121,7 +114,7 @@ def test_bright_light_is_read_without_an_error(bit_hz, clock, mark_on, late_us) 
         (12, 0, b"y? Thou art more lovely and more temperate: rough winds do shake the darling bud"),
     ],
 )
-def test_a_list_is_read_from_its_first_character_wherever_time_begins(seed, first_us, text) -> None:
+def test_a_list_is_read_from_its_first_character_wherever_time_begins(seed, first_us, text):
     levels = levels_of(np.frombuffer(text, np.uint8), 7, "even", 2)
     # Edges are seen late, so the first character begins before the first event.
     events = seen(np.random.default_rng(seed), levels, BIT_504_US, late_us=(60.0, 400.0), noise_hz=0.0)
@@ -141,7 +134,7 @@ def test_a_list_is_read_from_its_first_character_wherever_time_begins(seed, firs
         (10_000.0, (60.0, 50.0), (25.0, 30.0), 25),
     ],
 )
-def test_times_that_are_coarse_are_read_in_any_pieces(rate_hz, events, late_us, grain_us) -> None:
+def test_times_that_are_coarse_are_read_in_any_pieces(rate_hz, events, late_us, grain_us):
     """As a list rounds them, or a camera reads its events out in bunches that shift against the bits."""
     sent = np.random.default_rng(1).integers(0, 128, 60)
     bit_us = 1e6 / rate_hz * 1.002
@@ -164,12 +157,12 @@ def test_times_that_are_coarse_are_read_in_any_pieces(rate_hz, events, late_us, 
 
 
 @pytest.mark.parametrize("cut", [0, 3, 8])
-def test_a_stream_that_begins_within_a_character_gives_none_that_was_not_sent(cut: int) -> None:
+def test_a_stream_that_begins_within_a_character_gives_none_that_was_not_sent(cut):
     """The next one may start at any bit that is 0: what could be read otherwise as well is left out."""
     rng = np.random.default_rng(cut)
     bit_us, pause = 100.0, 16
     sent = rng.integers(0, 256, 40)
-    levels: list[int] = []
+    levels = []
     starts = []
     for k, value in enumerate(sent.tolist()):
         starts.append(len(levels))
@@ -187,10 +180,10 @@ def test_a_stream_that_begins_within_a_character_gives_none_that_was_not_sent(cu
     assert state.given["characters"] == len(read)
 
 
-def test_the_pause_tells_characters_of_a_recording_that_begins_within_a_packet() -> None:
+def test_the_pause_tells_characters_of_a_recording_that_begins_within_a_packet():
     """From within 35, 35 and 175 read as 246 and 253, too, and by their bits alone just as well."""
     packets = [[97, 119, 159, 35, 175], [28, 86, 233, 30, 5], [77, 124, 246, 18, 200], [3, 91, 44, 170, 66]]
-    levels: list[int] = []
+    levels = []
     for packet in packets:
         levels += [1] * 16 + levels_of(np.array(packet), 8, "even", 1)
     # From the last data bit of the 35 on.
@@ -206,7 +199,7 @@ def test_the_pause_tells_characters_of_a_recording_that_begins_within_a_packet()
 
 
 @cache
-def dim(events: tuple[float, float], unseen: float, many: int) -> tuple[np.ndarray, Events, list[Character]]:
+def dim(events, unseen, many):
     """Characters that were sent by a dim light, what is seen of it, and those that are read."""
     rng = np.random.default_rng(17)
     sent = rng.integers(0, 128, many)
@@ -219,7 +212,7 @@ DIM = [((4.0, 3.0), 0.03, 160), ((8.0, 6.0), 0.01, 150)]
 
 
 @pytest.mark.parametrize(("events", "unseen", "many"), DIM)
-def test_errors_are_those_of_a_receiver_that_knows_the_light(events, unseen, many) -> None:
+def test_errors_are_those_of_a_receiver_that_knows_the_light(events, unseen, many):
     """Beside one that is told when each character starts, how late events are, and how many come."""
     bit_us = DIM_BIT_US
     sent, light, found = dim(events, unseen, many)
@@ -229,14 +222,14 @@ def test_errors_are_those_of_a_receiver_that_knows_the_light(events, unseen, man
     ours = wrong_bits([found[k].value for k in nearest], sent.tolist(), 7)
 
     # The ideal one: likelihoods of all words from the densities that made the events.
-    def density(after_us: np.ndarray, late_us: float) -> np.ndarray:
+    def density(after_us, late_us):
         safe = np.maximum(after_us, 1e-9)
         spread = np.exp(-0.5 * (np.log(safe / late_us) / 0.5) ** 2) / (safe * 0.5 * math.sqrt(2 * math.pi))
         return np.where(after_us > 0, spread, 0.0)
 
     strengths = np.random.default_rng(0).gamma(8, 1 / 8, 32)
 
-    def evidence(at_us: float, on: bool) -> float:
+    def evidence(at_us, on):
         inside = (light.t_us + 0.5 > at_us) & (light.t_us + 0.5 < at_us + 4 * bit_us) & (light.p == on)
         shape = density(light.t_us[inside] + 0.5 - at_us, (60.0, 110.0)[not on])
         means = (events[0] if on else events[1]) * strengths
@@ -257,7 +250,7 @@ def test_errors_are_those_of_a_receiver_that_knows_the_light(events, unseen, man
     assert ours <= 1.15 * best + 3 * math.sqrt(4 * best / (7 * many))
 
 
-def test_llrs_tell_the_truth() -> None:
+def test_llrs_tell_the_truth():
     sent, _, found = dim(*DIM[0])
     assert len(found) == len(sent)
     right = np.array([c.value for c in found]) == sent
@@ -271,12 +264,12 @@ def test_llrs_tell_the_truth() -> None:
 @pytest.mark.parametrize(
     ("seed", "pause", "after_pause"), [(4, 0, 5.0), (4, 3, 2.0), (6, 3, 2.0), (6, 2, 4.5)]
 )
-def test_the_best_path_is_the_best_of_all(seed: int, pause: int, after_pause: float) -> None:
+def test_the_best_path_is_the_best_of_all(seed, pause, after_pause):
     rng = np.random.default_rng(seed)
     scores, tails = rng.normal(4, 6, 14), rng.normal(0, 2, 14)
     starts, worth = _kernels.best_path(scores, tails, 4, 0, 1, 5.0, 1.0, 0.5, pause, after_pause)
 
-    def cost(path: tuple[int, ...]) -> float:
+    def cost(path):
         total = 0.0
         for k, s in enumerate(path):
             if not k:
@@ -298,19 +291,19 @@ def test_the_best_path_is_the_best_of_all(seed: int, pause: int, after_pause: fl
     assert tuple(starts.tolist()) == best
 
 
-def _link(**air: float) -> Link:
+def _link(**air):
     air = {"chip_rate_hz": 3125.0, "frames_per_packet": 100} | air
     framing = {"id": "uart", "data_bits": 7, "parity": "even", "stop_bits": 2}
     return resolve({"bar": BAR, "air": air, "framing": framing, "detection": {"id": "whole"}})
 
 
-def _received(link: Link, events: Events, size: int) -> tuple[list[Packet], dict[str, int]]:
+def _received(link, events, size):
     receiver = Receiver(link)
     packets = [p for k in range(0, len(events), size) for p in receiver.feed(events[k : k + size])]
     return packets + receiver.close(), receiver.counts
 
 
-def test_a_text_comes_through_the_receiver_in_any_pieces() -> None:
+def test_a_text_comes_through_the_receiver_in_any_pieces():
     link = _link()
     symbols = compose(link, text="Works ahead", transmitter_id=7, sequence=3)
     chips = np.concatenate([packet_chips(one, link.codebook)[:, 0] for one in symbols] * 2)
@@ -329,7 +322,7 @@ def test_a_text_comes_through_the_receiver_in_any_pieces() -> None:
 
 
 @pytest.mark.parametrize("extra", [-8, 44])
-def test_packets_behind_another_pause_than_is_stated_are_whole(extra: int) -> None:
+def test_packets_behind_another_pause_than_is_stated_are_whole(extra):
     """44 bits more are four characters, by which a frame's place was off."""
     link, rng = _link(), np.random.default_rng(3)
     sent = rng.integers(0, 128, (6, 100, 1))
@@ -347,7 +340,7 @@ def test_packets_behind_another_pause_than_is_stated_are_whole(extra: int) -> No
 
 
 @pytest.mark.parametrize("idle", ["off", "on"])
-def test_a_pause_has_no_characters(idle: str, tmp_path: Path) -> None:
+def test_a_pause_has_no_characters(idle, tmp_path):
     """Packets with long pauses between, rendered pixel by pixel: what is dark says nothing."""
     framing = {"id": "uart", "idle": idle}
     link = resolve({"bar": BAR, "air": {"frames_per_packet": 100}, "framing": framing})
@@ -371,14 +364,12 @@ def test_a_pause_has_no_characters(idle: str, tmp_path: Path) -> None:
     assert 198 <= sum(len(packet.frames) for packet in found) <= 200
 
 
-def test_a_bar_of_clusters_is_refused() -> None:
+def test_a_bar_of_clusters_is_refused():
     with pytest.raises(ConfigError, match="framing 'uart': a bar of 16 clusters, expected one"):
         resolve({"framing": {"id": "uart"}})
 
 
-def received(
-    evlcp: Callable[..., Any], folder: Path, events: Events, query: str = "", **framing: Any
-) -> tuple[str, dict[str, Any]]:
+def received(evlcp, folder, events, query="", **framing):
     """What `receive` prints of a list of times and polarities, and its summary."""
     rows = "".join(f"{t},{p}\n" for t, p in zip(events.t_us.tolist(), events.p.tolist(), strict=True))
     (folder / "list.csv").write_text("t,p\n" + rows)
@@ -393,7 +384,7 @@ def received(
 SEVEN_EVEN = {"data_bits": 7, "parity": "even", "stop_bits": 2}
 
 
-def test_text_is_given_as_it_is_read(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+def test_text_is_given_as_it_is_read(tmp_path, evlcp):
     """The highest bit first; and what is said where it is not told."""
     text = "Rough winds do shake the darling buds of May, " * 3
     levels = levels_of(np.frombuffer(text.encode(), np.uint8), 7, "even", 2, True)
@@ -418,7 +409,7 @@ def test_text_is_given_as_it_is_read(tmp_path: Path, evlcp: Callable[..., Any]) 
         (9, "odd", 2, 3125.0, False, "off"),
     ],
 )
-def test_a_light_the_other_way_round_is_read(data_bits, parity, stop_bits, bit_hz, mark_on, idle) -> None:
+def test_a_light_the_other_way_round_is_read(data_bits, parity, stop_bits, bit_hz, mark_on, idle):
     rng = np.random.default_rng(data_bits + mark_on)
     sent = rng.integers(0, 1 << data_bits, 70)
     bit_us = 1e6 / bit_hz
@@ -433,7 +424,7 @@ def test_a_light_the_other_way_round_is_read(data_bits, parity, stop_bits, bit_h
 
 
 @pytest.mark.parametrize("clock", [-0.025, 0.02])
-def test_a_text_is_read_from_its_first_stretch_on_whatever_the_clock(clock: float) -> None:
+def test_a_text_is_read_from_its_first_stretch_on_whatever_the_clock(clock):
     """A few characters follow the part that is learned from, and fit from another bit on, too."""
     text = b"rag thou wander'st in his shade, When in eternal lines to time thou grow'st: So long as men can "
     sent = np.frombuffer(text + b"brea", np.uint8).astype(np.int64)
@@ -447,12 +438,12 @@ def test_a_text_is_read_from_its_first_stretch_on_whatever_the_clock(clock: floa
     assert wrong_bits([one.value for one in found[-98:]], sent[-98:].tolist(), 7) < 0.01
 
 
-def test_what_a_list_has_wrong_is_said(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+def test_what_a_list_has_wrong_is_said(tmp_path, evlcp):
     """Polarities that are turned, or of one kind alone; and what the list did not say."""
     sent = np.random.default_rng(4).integers(0, 128, 60)
     events = seen(np.random.default_rng(3), levels_of(sent, 7, "even", 2), 320.0)
 
-    def told(kept: Events, query: str = "") -> dict[str, Any]:
+    def told(kept, query=""):
         return received(evlcp, tmp_path, kept, query, **SEVEN_EVEN)[1]
 
     turned = Events.of(events.t_us, events.x, events.y, 1 - events.p)
@@ -468,10 +459,10 @@ def test_what_a_list_has_wrong_is_said(tmp_path: Path, evlcp: Callable[..., Any]
     assert "events are ON: when the light goes off is not seen" in on["text"]
 
 
-def test_a_lamp_that_reads_as_one_character_is_said(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+def test_a_lamp_that_reads_as_one_character_is_said(tmp_path, evlcp):
     """A period of ten bits, half of it dark: 8N1 reads 0xF0 for ever. A text with blanks is none."""
 
-    def warnings_of(levels: list[int]) -> Any:
+    def warnings_of(levels):
         return received(evlcp, tmp_path, seen(np.random.default_rng(3), levels, 320.0))[1]["warnings"]
 
     lamp = warnings_of([1, *[0, 0, 0, 0, 0, 1, 1, 1, 1, 1] * 120])
@@ -490,9 +481,7 @@ def test_a_lamp_that_reads_as_one_character_is_said(tmp_path: Path, evlcp: Calla
         (8, "none", 1, 9600.0, True, 0.0, {"late_us": (40.0, 60.0)}),
     ],
 )
-def test_rate_and_format_of_a_light_are_found(
-    data_bits, parity, stop_bits, bit_hz, mark_on, clock, light
-) -> None:
+def test_rate_and_format_of_a_light_are_found(data_bits, parity, stop_bits, bit_hz, mark_on, clock, light):
     rng = np.random.default_rng(2)
     levels = levels_of(rng.integers(0, 1 << data_bits, 90), data_bits, parity, stop_bits)
     light = {"mark_on": mark_on, "noise_hz": bit_hz / 10, "start_us": 2e6} | light
@@ -505,7 +494,7 @@ def test_rate_and_format_of_a_light_are_found(
     assert found == {f"framing.{key}": value for key, value in expected.items()}
 
 
-def light_of(kind: str) -> Events:
+def light_of(kind):
     """What is no asynchronous light: bits without a frame, or that repeat themselves."""
     rng = np.random.default_rng(4)
     bits = rng.integers(0, 2, 800)
@@ -521,14 +510,14 @@ def light_of(kind: str) -> Events:
 
 
 @pytest.mark.parametrize("kind", ["random bits", "pair codes", "a lamp", "PWM", "a pattern", "no light"])
-def test_other_light_is_no_asynchronous_one(kind: str) -> None:
+def test_other_light_is_no_asynchronous_one(kind):
     events = light_of(kind)
     found, said = infer(events.t_us, events.p)
     assert found == {}
     assert said.startswith("no asynchronous light found: at best ")
 
 
-def test_a_list_is_received_without_a_link(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+def test_a_list_is_received_without_a_link(tmp_path, evlcp):
     text = "Rough winds do shake the darling buds of May, " * 3
     codes = np.frombuffer(text.encode(), np.uint8).astype(int)
     turned = np.array([int(f"{code:07b}"[::-1], 2) for code in codes.tolist()])
@@ -541,7 +530,7 @@ def test_a_list_is_received_without_a_link(tmp_path: Path, evlcp: Callable[..., 
 
 
 @pytest.mark.parametrize("seed", [3, 7])
-def test_pair_codes_without_a_parity_to_fail_are_none_of_characters(seed: int) -> None:
+def test_pair_codes_without_a_parity_to_fail_are_none_of_characters(seed):
     """What fits of them is as dim as it is wrong: the rest of the light speaks against it."""
     rng = np.random.default_rng(seed)
     values = rng.integers(0, 2, 260)
@@ -553,7 +542,7 @@ def test_pair_codes_without_a_parity_to_fail_are_none_of_characters(seed: int) -
 @pytest.mark.parametrize(
     "framing", [{}, {"parity": "even"}, {"data_bits": 7, "parity": "even", "stop_bits": 2}]
 )
-def test_a_bar_in_view_is_no_light_of_characters(framing: dict[str, Any], demo_raw: Path) -> None:
+def test_a_bar_in_view_is_no_light_of_characters(framing, demo_raw):
     """By a link at the bar's own rate of chips; nor is it ever taken for one, which costs much time."""
     one = {"rows": 1, "columns": 1, "cluster_rows": 1, "cluster_columns": 1}
     link = resolve({"bar": one, "framing": {"id": "uart"} | framing, "air": {"frames_per_packet": 100}})
@@ -562,7 +551,7 @@ def test_a_bar_in_view_is_no_light_of_characters(framing: dict[str, Any], demo_r
         assert packets.counts["regions_opened"] == 0
 
 
-def test_the_beacons_bit_errors_are_those_against_the_text_that_is_repeated(tmp_path: Path) -> None:
+def test_the_beacons_bit_errors_are_those_against_the_text_that_is_repeated(tmp_path):
     """Of two repetitions and a third, with three bits that were sent otherwise; and of a part of one."""
     rng = np.random.default_rng(1)
     text = np.append(rng.integers(32, 127, 618), 127)
