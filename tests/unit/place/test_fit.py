@@ -146,12 +146,6 @@ def fitted(p: Problem, position: Floats, rotation: Floats) -> Equations:
     return found
 
 
-def sigmas_of(p: Problem, equations: Equations) -> Floats:
-    """Of the position, by the whole matrix."""
-    matrix = whole(p, equations)[1][np.ix_(free_of(p), free_of(p))]
-    return np.sqrt(np.diag(np.linalg.inv(matrix))[:3])
-
-
 def test_the_fit_is_that_of_scipy() -> None:
     rng = np.random.default_rng(3)
     p, position, rotation = problem(rng, noise=1.0)
@@ -176,7 +170,8 @@ def test_the_fit_is_that_of_scipy() -> None:
     scipy = least_squares(cost, np.zeros(31), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
     # The roll is about the level forward axis, not the pitched one.
     assert found.cost == pytest.approx(2 * scipy.cost, rel=5e-5)
-    sigma = sigmas_of(p, found)
+    spread = np.linalg.inv(whole(p, found)[1][np.ix_(free_of(p), free_of(p))])
+    sigma = np.sqrt(np.diag(spread)[:3])
     np.testing.assert_allclose(fit.position / sigma, (position + scipy.x[:3]) / sigma, atol=0.03)
     np.testing.assert_allclose(fit.lens, scipy.x[6:13], atol=0.03)
     np.testing.assert_allclose(fit.local.ravel(), scipy.x[13:], atol=0.03)

@@ -26,13 +26,6 @@ SPEC = ErrorModel(acceleration_m2_s3=0.5, gnss_s=4.0, gate_sigmas=50.0)
 SIGMA_M = {"bars": np.array([0.03, 0.05, 0.02]), GNSS: np.array([0.8, 0.6, 1.5])}
 
 
-def fix_of(t_s: float, enu_m: Floats, source: str) -> Fix:
-    spread = np.diag(SIGMA_M[source] ** 2)
-    share = SPEC.gnss_white_share if source == GNSS else 1.0
-    lasts = {GNSS: np.sqrt((1 - share) * spread)} if source == GNSS else {}
-    return fix(t_s * 1e6, enu_m, share * spread, covariance_m2=spread, standing=lasts, source=source)
-
-
 def mixed() -> list[tuple[float, str]]:
     """Bars at first and last, satellites all the time."""
     seen = [(0.04 + 0.1 * i, GNSS) for i in range(60)]
@@ -41,8 +34,13 @@ def mixed() -> list[tuple[float, str]]:
 
 
 def drive(rng: np.random.Generator) -> list[Fix]:
-    speed, off = np.array([3.0, 20.0, 0.1]), 0.3 * rng.normal(size=(len(mixed()), 3))
-    return [fix_of(t, speed * t + SIGMA_M[by] * o, by) for (t, by), o in zip(mixed(), off, strict=True)]
+    found = []
+    for t_s, source in mixed():
+        place = np.array([3.0, 20.0, 0.1]) * t_s + 0.3 * SIGMA_M[source] * rng.normal(size=3)
+        spread, share = np.diag(SIGMA_M[source] ** 2), SPEC.gnss_white_share if source == GNSS else 1.0
+        known = {"standing": {GNSS: np.sqrt((1 - share) * spread)}} if source == GNSS else {}
+        found.append(fix(t_s * 1e6, place, share * spread, covariance_m2=spread, source=source, **known))
+    return found
 
 
 def process(seen: list[tuple[float, str]], axis: int) -> tuple[Floats, Floats]:

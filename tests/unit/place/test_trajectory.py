@@ -48,25 +48,18 @@ def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
     assert max(p.mean[0] for p in smooth[:5]) < 10
 
 
-def moves_at(t_us: float, name: str) -> Floats:
-    """How a part's standing errors move a fix: more and less along a drive, as with the distance."""
-    share = 1 + 0.5 * np.sin(t_us * 1e-6 + len(name))
-    return np.array([[0.4, 0.1], [0.0, 0.3], [0.2, -0.1]]) * share
-
-
-def seen_by(t_us: float) -> list[str]:
-    """Three bars in turn, two at a time, and the camera."""
-    at = t_us * 1e-6
-    return ["camera", *(f"bar {i}" for i in range(3) if abs(at - 0.5 * i) < 0.6)]
-
-
 def disturbed(rng: np.random.Generator, count: int) -> list[Fix]:
-    """Fixes at uneven times with noise, errors of a memory and standing errors, anywhere: all is linear."""
+    """Fixes at uneven times with noise, errors of a memory and standing errors, anywhere: all is linear.
+
+    Of three bars in turn, two at a time, and the camera; they move fixes more and less along a drive.
+    """
     found = []
-    for t_us in 1e6 * np.cumsum(rng.uniform(0.01, 0.2, count)):
-        moves = {name: moves_at(t_us, name) for name in seen_by(t_us)}
+    for t_s in np.cumsum(rng.uniform(0.01, 0.2, count)):
+        seen = ["camera", *(f"bar {i}" for i in range(3) if abs(t_s - 0.5 * i) < 0.6)]
+        share = {name: 1 + 0.5 * np.sin(t_s + len(name)) for name in seen}
+        moves = {name: s * np.array([[0.4, 0.1], [0.0, 0.3], [0.2, -0.1]]) for name, s in share.items()}
         place = rng.normal(0, 3, 3)
-        found.append(fix(t_us, place, NOISE_M2, slow_m2=0.04 * np.eye(3), standing=moves))
+        found.append(fix(1e6 * t_s, place, NOISE_M2, slow_m2=0.04 * np.eye(3), standing=moves))
     return found
 
 

@@ -18,7 +18,6 @@ LINK = load_link()
 K, COLUMNS, FULL = 16, 4, 300.0
 RING_BAR = ["bar.shape=ring", "bar.leds=12", "bar.radius_m=0.25"]
 RING, SMALL = load_link(overrides=RING_BAR), load_link(overrides=[*RING_BAR, "bar.led_m=0.001"])
-FOCAL_PX = RING.camera.focal_px
 
 
 def bound(**how: float) -> float:
@@ -39,27 +38,21 @@ def test_the_bound_follows_noise_and_distance() -> None:
             layout_bound(RING, symbols=range(12), **given)
 
 
-def sigma_of_first(*by_boundary: np.ndarray, blur_px: float) -> float:
-    """Standard deviation of the first of parameters that move boundaries by so much, beside drift.
+@pytest.mark.parametrize("blur_px", [0.6, 0.9])
+def test_the_bound_is_that_of_boundaries_by_themselves(blur_px: float) -> None:
+    """Spacing is the first of parameters that move boundaries, beside place and drift.
 
     Where blur smooths the pixel grid, a boundary with a step of 2 has the information
     sum of (2 gain pdf)^2 = 2 gain^2 / (sqrt(pi) blur) a column and value, wherever it lies.
     """
     codes = np.concatenate([LINK.codebook.pilot_edges, LINK.codebook.codeword_edges[np.arange(K)]], axis=1)
-    steps = np.diff(codes.astype(float), axis=0)
-    values = codes.shape[1]
-    each = 0.8**2 * steps**2 / (2 * np.sqrt(np.pi) * blur_px) * 5 / 0.3**2
-    when = np.tile(np.arange(values) / values - 0.5, (K - 1, 1))
-    slopes = np.stack([*(np.repeat(column[:, None], values, 1) for column in by_boundary), when])
+    each = 0.8**2 * np.diff(codes.astype(float), axis=0) ** 2 / (2 * np.sqrt(np.pi) * blur_px) * 5 / 0.3**2
+    apart, when = np.arange(1, K)[:, None] - K / 2, np.arange(codes.shape[1]) / codes.shape[1] - 0.5
+    slopes = np.stack(np.broadcast_arrays(apart, 1.0, when))
     information = np.einsum("aki,bki,ki->ab", slopes, slopes, each)
-    return float(np.sqrt(np.linalg.inv(information)[0, 0]))
-
-
-@pytest.mark.parametrize("blur_px", [0.6, 0.9])
-def test_the_bound_is_that_of_boundaries_by_themselves(blur_px: float) -> None:
-    want = sigma_of_first(np.arange(1, K) - K / 2, np.ones(K - 1), blur_px=blur_px)
     spacing_px = LINK.camera.focal_px * 0.06 / 50
-    assert bound(blur_px=blur_px) == pytest.approx(50 / spacing_px * want, rel=0.02)
+    want = 50 / spacing_px * np.sqrt(np.linalg.inv(information)[0, 0])
+    assert bound(blur_px=blur_px) == pytest.approx(want, rel=0.02)
 
 
 def view_of(
@@ -170,16 +163,12 @@ FAINT, BLUR_PX, NOISE = 1e3, 1.5, 1e-4
 VALUES = RING.codebook.pilot_edges.shape[1] + RING.codebook.codeword_edges.shape[1]
 
 
-def one_led_information(side_px: float, gain: float = 0.8) -> float:
-    """Of the place of one small, blurred, faint LED along an axis: values pi / 2 (peak / noise)^2."""
-    peak = gain / FAINT * side_px**2 / (2 * math.pi * BLUR_PX**2)
-    return VALUES * math.pi / 2 * (peak / NOISE) ** 2
-
-
 @pytest.mark.parametrize("distance_m", [30.0, 50.0])
 def test_a_ring_of_faint_leds_has_the_closed_form(distance_m: float) -> None:
-    px_per_m = FOCAL_PX / distance_m
-    each = one_led_information(0.001 * px_per_m)
+    px_per_m = RING.camera.focal_px / distance_m
+    # Of the place of one small, blurred, faint LED along an axis: values pi / 2 (peak / noise)^2.
+    peak = 0.8 / FAINT * (0.001 * px_per_m) ** 2 / (2 * math.pi * BLUR_PX**2)
+    each = VALUES * math.pi / 2 * (peak / NOISE) ** 2
     found = layout_bound(SMALL, distance_m, range(12), blur_px=BLUR_PX, noise=NOISE, dark=FAINT)
     radius_px, radius_m = 0.25 * px_per_m, 0.25
     together = math.sqrt(12 * each)

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -24,8 +23,6 @@ from evlcp_sdk.study.tally import Statistics
 from tests.conftest import ROOT
 from tests.unit.study.fake import fake_plan, run_fake
 from tests.unit.test_signals import start
-
-Watch = Callable[[Progress], None]
 
 
 def collected(plan, path, executor=None, watch=lambda _: None) -> tuple[Progress, list[Statistics]]:
@@ -260,10 +257,7 @@ def test_without_dask(monkeypatch: pytest.MonkeyPatch) -> None:
         DaskCluster("tcp://127.0.0.1:9")
 
 
-Evlcp = Callable[..., Any]
-
-
-def test_processes_give_what_this_one_gives(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
+def test_processes_give_what_this_one_gives(evlcp, demo_raw: Path, tmp_path: Path) -> None:
     two = [Path(shutil.copy(demo_raw, tmp_path / f"{name}.raw")) for name in "ab"]
     (tmp_path / "bad.raw").write_bytes(b"\x89PNG" + bytes(60))
     done = evlcp("receive", *two, tmp_path / "bad.raw", "-o", tmp_path / "out", "--workers", "2", "--json")

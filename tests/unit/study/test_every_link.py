@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.study.task import plan_of
 from tests.conftest import Brings
 
-Evlcp = Callable[..., Any]
 Settings = dict[str, Any]
 
 
@@ -68,7 +66,7 @@ def options(settings: Settings, before: str = "") -> list[str]:
     return [part for k, v in settings.items() for part in ("--set", f"{before}{k}={toml_value(v)}")]
 
 
-def run(evlcp: Evlcp, *args: str | Path) -> str:
+def run(evlcp, *args: str | Path) -> str:
     done = evlcp(*args)
     assert (done.code, done.err) == (0, "")
     out: str = done.out
@@ -77,7 +75,7 @@ def run(evlcp: Evlcp, *args: str | Path) -> str:
 
 @pytest.mark.usefixtures("_stranger")
 @pytest.mark.parametrize("name", LINKS)
-def test_all_commands_agree(name: str, evlcp: Evlcp, tmp_path: Path) -> None:
+def test_all_commands_agree(name: str, evlcp, tmp_path: Path) -> None:
     link = LINKS[name]
     raw, out, results = tmp_path / "r.raw", tmp_path / "out", tmp_path / "r.sqlite"
     scene: Settings = {"duration_s": DURATIONS_S.get(name, 0.07), "motion.distance_m": 40.0}
@@ -212,7 +210,7 @@ def test_another_link_is_refused_by_all(settings, says, evlcp, tmp_path) -> None
         assert done.err == ("" if says is None else line)
 
 
-def test_links_that_share_what_is_on_air_share_a_rendering(evlcp: Evlcp, tmp_path: Path) -> None:
+def test_links_that_share_what_is_on_air_share_a_rendering(evlcp, tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text(
         '[campaign]\nname = "some"\nseeds = 2\n[scene]\nbase = "night"\n[link.variants]\n'
         'paper = {}\nother-ranging = { ranging.id = "poc" }\nslow = { air.chip_rate_hz = 5000.0 }\n'

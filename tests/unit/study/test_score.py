@@ -3,7 +3,7 @@
 import json
 import math
 import runpy
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -244,7 +244,7 @@ def test_what_cannot_be_scored_is_reported_in_one_line(
     assert summary is None or done.err.startswith(f"evlcp: {tmp_path}/summary.json: ")
 
 
-def test_a_result_of_another_recording_is_reported(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+def test_a_result_of_another_recording_is_reported(tmp_path: Path, evlcp) -> None:
     truth = scene_truths()["two"]
     (tmp_path / "frames.csv").write_text(text_of(faulty_rows(truth, Lengths(), 5)))
     (tmp_path / "own.json").write_text(json.dumps(truth))

@@ -1,10 +1,8 @@
 """`evlcp sweep` and `evlcp report` from a campaign file to figures, with real light."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,8 +15,6 @@ from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import summarize
 from evlcp_sdk.study.task import plan_of, run_job
 from tests.conftest import ROOT
-
-Evlcp = Callable[..., Any]
 
 CAMPAIGN = """
 [campaign]
@@ -45,7 +41,7 @@ def campaign(tmp_path: Path) -> Path:
     return path
 
 
-def test_from_a_file_to_figures(evlcp: Evlcp, campaign: Path, tmp_path: Path) -> None:
+def test_from_a_file_to_figures(evlcp, campaign: Path, tmp_path: Path) -> None:
     results = tmp_path / "r.sqlite"
     dry = evlcp("sweep", campaign, "-o", results, "--dry-run")
     assert (dry.code, "short: 0 of 4 tasks" in dry.out, results.exists()) == (0, True, False)
@@ -140,7 +136,7 @@ def test_the_shipped_campaigns_are_read() -> None:
     assert len(digests) == len(plan.scenes)
 
 
-def test_the_demo(evlcp: Evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo(evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     short = demo_campaign().read_text().replace("seeds = 5", "seeds = 1").replace("s = 0.3", "s = 0.07")
     (tmp_path / "short.toml").write_text(short)
     monkeypatch.setattr("evlcp_sdk.cli.demo.demo_campaign", lambda: tmp_path / "short.toml")
