@@ -11,16 +11,9 @@ from typing import Any, Self
 CHROMIUM = shutil.which("chromium")
 
 _FLAGS = (
-    "--headless",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
-    "--window-size=1200,900",
-    "--remote-debugging-pipe",
+    "--headless --disable-gpu --disable-quic --no-first-run --disable-background-networking --disable-sync"
+    " --disable-component-update '--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1'"
+    " --window-size=1200,900 --remote-debugging-pipe"
 )
 
 
@@ -31,12 +24,9 @@ class Browser:
         assert CHROMIUM is not None
         theirs_in, self._out = os.pipe()
         self._in, theirs_out = os.pipe()
-        flags = [*_FLAGS, f"--user-data-dir={profile}"]
-        if os.geteuid() == 0:
-            flags.append("--no-sandbox")
-        script = f'exec "$0" "$@" 3<&{theirs_in} 4>&{theirs_out}'
+        flags = f"{_FLAGS} '--user-data-dir={profile}'{' --no-sandbox' * (os.geteuid() == 0)}"
         self._process = subprocess.Popen(
-            ["bash", "-c", script, CHROMIUM, *flags, "about:blank"],
+            ["bash", "-c", f"exec {CHROMIUM} {flags} about:blank 3<&{theirs_in} 4>&{theirs_out}"],
             pass_fds=(theirs_in, theirs_out),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -65,8 +55,7 @@ class Browser:
             message = self._read()
             if message.get("id") == self._number:
                 assert "error" not in message, message
-                result: dict[str, Any] = message["result"]
-                return result
+                return message["result"]
             self.heard.append(message)
 
     def _read(self) -> dict[str, Any]:
@@ -75,8 +64,7 @@ class Browser:
             assert piece, "the browser is gone"
             self._buffer += piece
         text, _, self._buffer = self._buffer.partition(b"\0")
-        message: dict[str, Any] = json.loads(text)
-        return message
+        return json.loads(text)
 
     def open(self, place: Path | str) -> None:
         """Load a file, or what a server of this machine gives, and wait until it is there."""
@@ -145,7 +133,7 @@ class Browser:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind, value, trace) -> None:
+    def __exit__(self, *fault: object) -> None:
         self._process.kill()
         self._process.wait()
         os.close(self._in)
