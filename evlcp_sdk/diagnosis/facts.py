@@ -91,12 +91,7 @@ class Diagnostic:
 
     def to_dict(self) -> dict[str, Any]:
         """The same as JSON values, without verdict and stage."""
-        found = {
-            "code": self.code,
-            "text": self.text,
-            "next_step": self.next_step,
-            "transmitter": self.transmitter,
-        }
+        found = {name: getattr(self, name) for name in ("code", "text", "next_step", "transmitter")}
         return found | ({"link": self.link} if self.link else {})
 
 

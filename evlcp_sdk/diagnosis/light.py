@@ -85,12 +85,9 @@ camera that shakes moves by 3 px at the most."""
 _MOST_KEPT = 200_000
 """Events of a window that are kept."""
 
-_TAU_US = np.concatenate(
-    [
-        np.arange(FINE) * FINE_US + (FINE_US - 1) / 2,
-        FINE_US * FINE + np.arange(COARSE) * COARSE_US + (COARSE_US - 1) / 2,
-    ]
-)
+_FINE_TAU_US = np.arange(FINE) * FINE_US + (FINE_US - 1) / 2
+_COARSE_TAU_US = FINE_US * FINE + np.arange(COARSE) * COARSE_US + (COARSE_US - 1) / 2
+_TAU_US = np.concatenate([_FINE_TAU_US, _COARSE_TAU_US])
 """Middle of each bin of times between rises, which are whole us."""
 
 FREQUENCIES_HZ = np.geomspace(_LOWEST_HZ, _HIGHEST_HZ, _STEPS)
@@ -188,10 +185,8 @@ class LightSurvey:
             self.first_us = float(events.t_us[0])
         self.last_us = float(events.t_us[-1])
         columns = events.t_us, events.x, events.y, events.p
-        of_pixels, counts = (
-            (self._last_us, self._last_p, self._rise_us),
-            (self._intervals, self._gaps, self.signs),
-        )
+        of_pixels = self._last_us, self._last_p, self._rise_us
+        counts = self._intervals, self._gaps, self.signs
         _kernels.add_events(columns, of_pixels, counts, self._shift, _CALM_US)
         self.readout.add(events)
         self._keep(events)

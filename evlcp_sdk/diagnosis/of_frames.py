@@ -183,9 +183,8 @@ def check_alike(facts: Facts) -> Found:
     """Bars that send the same at the same time: a warning where it matters which is which."""
     alike = facts.counts.get("frames_alike", 0)
     if alike:
-        text = (
-            f"{counted(alike, 'frame')} of bars, or of a bright mirror, that send the same at the same time"
-        )
+        frames = counted(alike, "frame")
+        text = f"{frames} of bars, or of a bright mirror, that send the same at the same time"
         asked = {"positions": facts.positions_tried, "messages": facts.tally.messages()}
         what = [name for name, found in asked.items() if found]
         step = f"give each bar messages of its own: {' and '.join(what)} cannot say which is which"

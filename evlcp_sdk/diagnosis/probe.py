@@ -80,13 +80,8 @@ class Trial:
     @property
     def rank(self) -> tuple[bool, bool, float, float, int]:
         """What trials are sorted by, the best largest."""
-        return (
-            self.fits,
-            bool(self.said),
-            round(self.share, 2),
-            round(self.quality, 1),
-            -self.link.codebook.carrying,
-        )
+        share, quality = round(self.share, 2), round(self.quality, 1)
+        return self.fits, bool(self.said), share, quality, -self.link.codebook.carrying
 
     def options(self) -> str:
         """The changes as options of the command line; empty for the link as it was given."""

@@ -419,10 +419,6 @@ def _last(fix: Fix) -> dict[str, Any]:
 
 
 def _learnt_row(one: EstimatedBias) -> dict[str, Any]:
-    numbers = {name: getattr(one, name) for name in ("correction", "sigma", "stated_sigma")}
-    return {
-        "part": one.part,
-        "what": one.what,
-        **{name: float(f"{value:.6g}") for name, value in numbers.items()},
-        "determined": one.determined,
-    }
+    names = ("correction", "sigma", "stated_sigma")
+    numbers = {name: float(f"{getattr(one, name):.6g}") for name in names}
+    return {"part": one.part, "what": one.what, **numbers, "determined": one.determined}

@@ -176,11 +176,7 @@ class Calibrated:
 
 
 def calibrate(
-    views: Sequence[CalibrationView],
-    camera: CameraModel,
-    spec: ErrorModel = USUAL,
-    *,
-    limit_px: float = 2.0,
+    views: Sequence[CalibrationView], camera: CameraModel, spec: ErrorModel = USUAL, *, limit_px: float = 2.0
 ) -> Calibrated:
     """Fit the camera to all views.
 
@@ -413,18 +409,12 @@ class _Model:
 
 
 def solve_views(
-    views: Sequence[SeenView],
-    camera: CameraModel,
-    root: Floats,
-    common: tuple[float, float] = (0.0, 0.0),
+    views: Sequence[SeenView], camera: CameraModel, root: Floats, common: tuple[float, float] = (0.0, 0.0)
 ) -> SolvedViews:
     """Least squares over everything; `camera` is where the fit starts, the others as in `_Model`."""
-    surveys = {
-        number: sigma
-        for view in views
-        for number, sigma in view.survey.items()
-        if any(sigma) or view.bend_px.any()
-    }
+    surveys: dict[int, tuple[float, float, float]] = {}
+    for view in views:
+        surveys |= {n: sigma for n, sigma in view.survey.items() if any(sigma) or view.bend_px.any()}
     model = _Model(views, camera, root, common, surveys)
 
     def misses_of(x: Floats) -> Floats:

@@ -121,9 +121,8 @@ def _turned(level: Floats, headings: NDArray[np.floating]) -> Floats:
 
 def _widest_three(points: Floats, seen: Floats, bar: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Centres of the three bars that span the largest triangle, and sights of them, float64 (3, 3) each."""
-    centres, sights = (
-        np.array([part[bar == number].mean(0) for number in np.unique(bar)]) for part in (points, seen)
-    )
+    bars = [bar == number for number in np.unique(bar)]
+    centres, sights = (np.array([part[mine].mean(0) for mine in bars]) for part in (points, seen))
     if len(centres) < 3:
         return np.zeros((3, 3)), np.zeros((3, 3))
 

@@ -254,10 +254,8 @@ def _tested_parts(fit: Equations, spread: Floats) -> Iterator[tuple[str, _Tested
             half = np.diag(np.repeat([1 / spec.bar_fault_m, 1 / _BAR_TURN_RAD], 3))
             half[:3, 3:] = skewed((row[:3] - row[3:6] - fit.at.position)[None])[0].T / spec.bar_fault_m
             bound = half.T @ half
-        yield (
-            f"bar {number}",
-            _test(info[bar, :6, :6], info[bar, :, :6] * free, right[bar, :6], spread, bound),
-        )
+        own = info[bar, :6, :6], info[bar, :, :6] * free, right[bar, :6]
+        yield f"bar {number}", _test(*own, spread, bound)
     focal = (FOCAL_UNIT / spec.focal_fault) ** 2 if spec.focal_fault else 0.0
     column, side = info.sum(0)[:, FAULT : FAULT + 1], right[:, FAULT].sum().reshape(1)
     yield FOCAL, _test(column[FAULT:][:1], column * free, side, spread, np.full((1, 1), focal))

@@ -56,11 +56,7 @@ def _grid() -> NDArray[np.uint16]:
         return np.array(picture, np.uint16)
 
 
-PLACE = {
-    "latitude_deg": (-90.0, 90.0),
-    "longitude_deg": (-180.0, 180.0),
-    "height_m": (-12_000.0, 20_000.0),
-}
+PLACE = {"latitude_deg": (-90.0, 90.0), "longitude_deg": (-180.0, 180.0), "height_m": (-12_000.0, 20_000.0)}
 """Columns of a place on earth, and what they may be, least and most."""
 
 
@@ -254,11 +250,7 @@ def _check_covariance(where: str, spread: Floats) -> None:
 
 
 def gnss_fix(
-    log: GnssLog,
-    row: int,
-    axes: LocalAxes,
-    attitude: Attitude | None,
-    spec: ErrorModel,
+    log: GnssLog, row: int, axes: LocalAxes, attitude: Attitude | None, spec: ErrorModel
 ) -> Fix | None:
     """A fix of satellites as one of the camera; None where no heading tells where the antenna is from it."""
     here = LocalAxes(*log.place[row].tolist())

@@ -323,19 +323,16 @@ class Navigator:
     def estimated_biases(self) -> list[EstimatedBias]:
         """What the drive says so far of standing errors: of the camera, the attitude, the IMU, the sites."""
         link, sites = self._link, self.positioner.bars.stands_at
-        return estimate_biases(
-            self._standing, link.camera, link.camera_sigma, self._attitude, sites, self._spec
-        )
+        camera, sigma = link.camera, link.camera_sigma
+        return estimate_biases(self._standing, camera, sigma, self._attitude, sites, self._spec)
 
     def bars_enu_m(self) -> dict[int, Floats]:
         """Centres of the bars whose places are known, in the local axes, m, float64 (3,) each."""
         axes = self.positioner.axes
         if axes is None:
             return {}
-        return {
-            number: axes.to_enu(site.latitude_deg, site.longitude_deg, site.height_m)
-            for number, site in self.positioner.bars.stands_at.items()
-        }
+        sites = self.positioner.bars.stands_at.items()
+        return {n: axes.to_enu(s.latitude_deg, s.longitude_deg, s.height_m) for n, s in sites}
 
     def _filter(self, fix: Fix) -> Placed:
         if fix.refusal:

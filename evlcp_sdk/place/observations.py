@@ -277,9 +277,8 @@ class Problem:
                 parts.append(np.concatenate(columns, 1))
                 errors.append(shared_errors(view, whole, spec, between))
         if not kept:
-            return Rejection(
-                "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
-            )
+            why = f"{most} whole clusters of a bar seen, {spec.min_points} needed"
+            return Rejection("too-few-clusters", why)
         problem = cls(
             camera=camera,
             attitude=attitude,

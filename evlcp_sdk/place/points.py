@@ -172,9 +172,8 @@ def _off(points: Floats, layout_m: Floats) -> tuple[float, int]:
         return 0.0, 0
     at = at / np.abs(at).max()
     squares = (at[:, :, None] * at[:, None]).reshape(len(at), 9)
-    modes, size, _ = np.linalg.svd(
-        np.concatenate([np.ones((len(at), 1)), at, squares], 1), full_matrices=False
-    )
+    terms = np.concatenate([np.ones((len(at), 1)), at, squares], 1)
+    modes, size, _ = np.linalg.svd(terms, full_matrices=False)
     modes = modes[:, size > _SAME * size[0]]
     many = len(at) - modes.shape[1]
     if many < _FEWEST:
@@ -242,11 +241,7 @@ class BarPoint:
 
 
 def bar_point(
-    frame: Frame,
-    length_m: float,
-    camera: CameraModel,
-    sigma: CameraSigma = EXACT,
-    spec: ErrorModel = USUAL,
+    frame: Frame, length_m: float, camera: CameraModel, sigma: CameraSigma = EXACT, spec: ErrorModel = USUAL
 ) -> BarPoint | None:
     """Where the centre of a frame's bar is; None where the frame has no distance.
 

@@ -98,9 +98,8 @@ def reckon(
         up = np.interp(s, motion.t_s, pushed[:, 2])
         climb = _running(s, up)
         high = _running(s, climb)
-        added = np.array(
-            [place[-1].real, place[-1].imag, high[-1], speed[-1].real, speed[-1].imag, climb[-1]]
-        )
+        there, then = place[-1], speed[-1]
+        added = np.array([there.real, there.imag, high[-1], then.real, then.imag, climb[-1]])
     move = np.eye(6)
     move[:2, 3:5], move[3:5, 3:5] = _matrix(move_to[0]), _matrix(move_to[1])
     move[2, 5] = span
@@ -418,11 +417,8 @@ def _smoothed(points: Sequence[TrajectoryPoint], spec: ErrorModel) -> list[Traje
         gain = np.linalg.solve(spread, crossed).T
         there = after.covariance[np.ix_(common, common)]
         covariance = here.covariance + gain @ (there - spread) @ gain.T
-        smoothed[i] = replace(
-            here,
-            mean=here.mean + gain @ (after.mean[common] - mean),
-            covariance=(covariance + covariance.T) / 2,
-        )
+        moved = here.mean + gain @ (after.mean[common] - mean)
+        smoothed[i] = replace(here, mean=moved, covariance=(covariance + covariance.T) / 2)
     return smoothed
 
 
@@ -484,9 +480,8 @@ def _expected(ahead: TrajectoryPoint, fix: Fix) -> tuple[TrajectoryPoint, Floats
     # Of the line through all of so many fixes, until older ones count less: Brookner, Tracking, 1998, 1.2.10.
     by_place = max(2 * (2 * count + 1) / ((count + 1) * (count + 2)), 1 - fade**2)
     by_speed = max(6 / ((count + 1) * (count + 2)), (1 - fade) ** 2)
-    course = Course(
-        place + by_place * away, speed + by_speed * away / max(dt, 1e-6), count + 1, fix.transmitters
-    )
+    place, speed = place + by_place * away, speed + by_speed * away / max(dt, 1e-6)
+    course = Course(place, speed, count + 1, fix.transmitters)
     if count < _FORESEEN:
         away = fix.enu_m - course.place_m
     sigmas = math.sqrt(float(away @ np.linalg.solve(fix.noise_m2 + fix.slow_m2, away)))
@@ -502,10 +497,7 @@ def _course(fix: Fix) -> Course:
 def _moved(fix: Fix, away_m: Floats) -> Fix:
     """A fix with what errors that stay do to it where its noise is less by so much, float64 (3,)."""
     along_m, slopes = float(fix.along @ away_m), fix.standing_slope
-    moves = {
-        name: moves - along_m * slopes[name] if name in slopes else moves
-        for name, moves in fix.standing.items()
-    }
+    moves = {n: m - along_m * slopes[n] if n in slopes else m for n, m in fix.standing.items()}
     return replace(fix, standing=moves)
 
 

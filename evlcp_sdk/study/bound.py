@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -487,14 +488,10 @@ class _Image:
         c, s = math.cos(turn), math.sin(turn)
         u = fit["x_px"] + near * (c * x - s * y)
         v = fit["y_px"] + near * (s * x + c * y)
-        across, down = (
-            ndtr((self.grid - at[:, None] + side / 2) / blur)
-            - ndtr((self.grid - at[:, None] - side / 2) / blur)
-            for at in (u, v)
-        )
-        light = np.stack(
-            [(down[a:b].T @ across[a:b]).ravel() for a, b in zip(self.first, self.first[1:], strict=False)]
-        )
+        beside = (self.grid - at[:, None] for at in (u, v))
+        across, down = (ndtr((away + side / 2) / blur) - ndtr((away - side / 2) / blur) for away in beside)
+        parts = [slice(a, b) for a, b in pairwise(self.first)]
+        light = np.stack([(down[part].T @ across[part]).ravel() for part in parts])
         seen: Array = fit["gain"] * (self.codes.T @ (light / (light.sum(0) + math.exp(fit["dark"]))))
         return seen
 

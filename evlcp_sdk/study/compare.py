@@ -83,9 +83,8 @@ def load_variants(
         odd = [s for s in settings if not _SETTING.fullmatch(s)]
         if not colon or not name or odd:
             what = f" ('{odd[0]}')" if odd else ""
-            faults.append(
-                f"--variant {text}{what}: expected NAME:TABLE.KEY=VALUE,..., e.g. mine:ranging.id=poc"
-            )
+            expected = "expected NAME:TABLE.KEY=VALUE,..., e.g. mine:ranging.id=poc"
+            faults.append(f"--variant {text}{what}: {expected}")
             continue
         if name in [v.name for v in found]:
             faults.append(f"--variant {text}: the name '{name}' is taken by another variant")

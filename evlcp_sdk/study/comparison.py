@@ -349,9 +349,8 @@ class Comparison:
         tables = []
         for one in sorted(self.tables, key=lambda one: not one.together):
             head, lines = one.cells()
-            rows = [
-                [Markup("<b>{}</b>").format(text) if best else text for text, best in row] for row in lines
-            ]
+            bold = Markup("<b>{}</b>").format
+            rows = [[bold(text) if best else text for text, best in row] for row in lines]
             tables.append((one.name, head, rows))
         title = f"Variants compared: {self.title}"
         return render_page("comparison.html", title, comparison=self, tables=tables)
@@ -373,15 +372,11 @@ def of_campaign(summary: Summary) -> Comparison:
     scenes: dict[str, dict[str, Measured]] = {}
     for series in summary.series:
         scene, link = _part(series, "scene.", "the scene"), _part(series, "link.", "the link")
-        settings = [
-            f"{k.removeprefix('link.')}={v}" for k, v in series.labels.items() if k.startswith("link.")
-        ]
+        labels = {k: v for k, v in series.labels.items() if k.startswith("link.")}
+        settings = [f"{k.removeprefix('link.')}={v}" for k, v in labels.items()]
         identity = series.link if isinstance(series.link, Mapping) else {}
-        links[link] = {
-            "settings": settings,
-            "digest": identity.get("digest", ""),
-            "configuration": identity.get("table", {}),
-        }
+        about = {"digest": identity.get("digest", ""), "configuration": identity.get("table", {})}
+        links[link] = {"settings": settings, **about}
         recordings = {f"seed {i}": one for i, one in enumerate(series.recordings)}
         rows = scenes.setdefault(scene, {})
         rows[link] = rows.get(link, Measured()) + Measured(recordings)

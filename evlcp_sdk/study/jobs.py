@@ -195,10 +195,7 @@ def _attempt(function: Callable[[J], R], job: J) -> Outcome[J, R]:
 
 
 def _run(
-    start: Callable[[J], Future[Any]],
-    room: Callable[[], int],
-    died: type[Exception],
-    jobs: Iterable[J],
+    start: Callable[[J], Future[Any]], room: Callable[[], int], died: type[Exception], jobs: Iterable[J]
 ) -> Generator[Outcome[J, Any], None, None]:
     """Keep as many jobs under way as there is room for; one whose worker dies is started again."""
     from concurrent.futures import FIRST_COMPLETED, wait

@@ -107,9 +107,8 @@ class BarFrames:
             _hide(bar, start_us, end_us, hidden, cut)
         sent = (start_us >= 0) & (end_us + _tail_us(packet) < truth.duration_us) & ~cut.all(1)
         # Most of what ranging uses is the pilot, and its middle the time that the distance is of.
-        middle = (
-            np.where(long > packet.info_chips, packet.pilot_chips, packet.info_chips) / 2 * packet.chip_us
-        )
+        chips = np.where(long > packet.info_chips, packet.pilot_chips, packet.info_chips)
+        middle = chips / 2 * packet.chip_us
         distance_m: Floats = np.interp(start_us[sent] + middle[sent], truth.t_us, bar.distance_m)
         symbols = np.asarray(bar.symbols, np.int64).reshape(-1, clusters)[: len(chip)]
         return cls(bar, start_us[sent], start_us[~sent], symbols[sent], distance_m, hidden[sent], cut[sent])
@@ -147,11 +146,7 @@ class Matched:
 
 
 def match(
-    frames: Iterable[FrameRow],
-    truth: Truth,
-    *,
-    road: bool = True,
-    links: Mapping[str, Link] | None = None,
+    frames: Iterable[FrameRow], truth: Truth, *, road: bool = True, links: Mapping[str, Link] | None = None
 ) -> Matched:
     """Put each decoded frame beside the sent one.
 
@@ -212,9 +207,8 @@ def sent_packets(bar: SentBar, truth: Truth) -> tuple[Floats, NDArray[np.bool_],
     """
     packet = bar.link.packet
     period_us = packet.packet_chips / bar.rate_hz * 1e6
-    start_us: Floats = (
-        np.arange(len(bar.symbols), dtype=np.float64) * period_us - bar.start_chip / bar.rate_hz * 1e6
-    )
+    first_us = -bar.start_chip / bar.rate_hz * 1e6
+    start_us: Floats = np.arange(len(bar.symbols), dtype=np.float64) * period_us + first_us
     whole = (start_us >= 0) & (start_us + period_us + _tail_us(packet) < truth.duration_us)
     distance_m: Floats = np.interp(start_us + period_us / 2, truth.t_us, bar.distance_m)
     return start_us, whole, distance_m

@@ -72,18 +72,16 @@ def statistics_of(
     """
     frames = list(frames)
     matched = match(frames, truth, links=links)
-    tallies = [
-        tally
-        for sent, pairs in zip(matched.bars, matched.pairs, strict=True)
-        for tally in bar_tallies(sent, pairs)
-    ]
+    tallies = list(others)
+    for sent, pairs in zip(matched.bars, matched.pairs, strict=True):
+        tallies += bar_tallies(sent, pairs)
     return replace(
         without_truth(frames, packets),
         tasks=1,
         events=events,
         duration_us=round(truth.duration_us),
         unmatched=matched.unmatched,
-        segments=Statistics.of([*tallies, *others]).segments,
+        segments=Statistics.of(tallies).segments,
     )
 
 
@@ -105,11 +103,9 @@ def message_tallies(packets: Iterable[Packet], truth: Truth, coder: BlockCoder) 
     """Hold the blocks of packets against what was sent: one tally a packet, with the start of its segment."""
     bars = [bar for bar in truth.bars if bar.sends_frames and bar.payload != "symbols"]
     sent = [sent_packets(bar, truth) for bar in bars]
-    tallies = [
-        (segment_of(at), Tally(messages_sent=1))
-        for _, whole, distance_m in sent
-        for at in distance_m[whole].tolist()
-    ]
+    tallies = []
+    for _, whole, distance_m in sent:
+        tallies += [(segment_of(at), Tally(messages_sent=1)) for at in distance_m[whole].tolist()]
     for packet in packets:
         if packet.block is None or not packet.frames or packet.echo_of is not None:
             continue

@@ -142,13 +142,8 @@ def _draw_bins(plot: Plot, series: Series, colour: str, dash: Dash) -> None:
     bins = range(min(counts) - 1, max(counts) + 2)
     shares = [counts.get(bin, 0) / tally.ranged for bin in bins]
     edges = [bin * BIN_M for bin in (*bins, bins[-1] + 1)]
-    plot.line(
-        [edge for edge in edges for _ in (0, 1)][1:-1],
-        [share for share in shares for _ in (0, 1)],
-        colour,
-        series.name,
-        dash,
-    )
+    x, y = ([value for value in values for _ in (0, 1)] for values in (edges, shares))
+    plot.line(x[1:-1], y, colour, series.name, dash)
     labels = [
         f"{series.name}\n{low:+.2f} to {low + BIN_M:+.2f} m: {counts.get(bin, 0)} of {tally.ranged}"
         for bin, low in zip(bins, edges, strict=False)

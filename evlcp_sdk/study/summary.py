@@ -54,9 +54,8 @@ class Series:
             if word in ("variant", "base", "id"):
                 parts.append(str(value))
             elif unit in _UNITS and isinstance(value, int | float):
-                parts.append(
-                    f"{value:g} {_UNITS[unit]}" if stem == "speed" else f"{stem} {value:g} {_UNITS[unit]}"
-                )
+                what = "" if stem == "speed" else f"{stem} "
+                parts.append(f"{what}{value:g} {_UNITS[unit]}")
             else:
                 parts.append(f"{word} {value}")
         name = ", ".join(parts) or "simulated"

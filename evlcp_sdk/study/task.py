@@ -50,12 +50,8 @@ def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
         link = load_link(base, settings, registry)
         table = {section: dict(keys) for section, keys in link.table.items()}
         revisions = dict(link.revisions)
-        identity = {
-            "digest": link.digest,
-            "codebook": link.codebook.digest,
-            "revisions": revisions,
-            "table": table,
-        }
+        identity: dict[str, Any] = {"digest": link.digest, "codebook": link.codebook.digest}
+        identity |= {"revisions": revisions, "table": table}
         on_air = ({key: part[key] for key in _ON_AIR if key in part} for part in (table, revisions))
         group = digest_of([*on_air, link.codebook.digest])
         return Case(value=(table, link.digest), identity=json.loads(json.dumps(identity)), group=group)

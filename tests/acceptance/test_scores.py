@@ -98,10 +98,7 @@ def test_figures_are_reached(name: str, received: Receive) -> None:
 
 
 def test_sigma_tells_the_error_and_the_bar_is_where_frames_say(received: Receive) -> None:
-    """Errors over sigmas are those of a normal distribution, within a factor of two in spread.
-
-    Places are right to a fifth of a pixel, though it shakes by half a pixel a millisecond: delays would show.
-    """
+    """Errors over sigmas are normal within a factor of two; places are right to .2 px: delays would show."""
     ratios, errors_px = [], []
     for name in ("night-50m-30kmh", "day-35m-20kmh", "tunnel-90m-30kmh", "lamps-60m-40kmh-rollover"):
         for row, _, true_m, true_px in frames_beside(name, received(name)):

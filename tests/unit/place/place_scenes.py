@@ -46,9 +46,6 @@ def square(error: Floats, covariance: Floats) -> float:
 
 
 def by_chance(squares: Sequence[float], freedom: int, level: float, slack: float = 1.0) -> bool:
-    """Whether the mean of independent squares is what right covariances make it with this probability.
-
-    `slack` widens the interval where what is fitted is not linear.
-    """
+    """Whether right covariances make the mean of squares so, at a level; `slack` for what is not linear."""
     low, high = stats.chi2.interval(level, freedom * len(squares))
     return bool(low / slack < np.sum(squares) < high * slack)

@@ -16,13 +16,7 @@ from scipy.special import huber
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.fit import FOCAL_UNIT, Equations, Fit, fit_pose, linearize, nearest_to_sights
 from evlcp_sdk.place.fit_assessment import Pose, _doubted, _test, assess_fit
-from evlcp_sdk.place.observations import (
-    BarView,
-    Problem,
-    project_bars,
-    shared_errors,
-    whole_clusters,
-)
+from evlcp_sdk.place.observations import BarView, Problem, project_bars, shared_errors, whole_clusters
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid, LedRing
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
@@ -55,10 +49,7 @@ def problem(rng: np.random.Generator, bars: int = 2, noise: float = 3.0) -> tupl
 
 
 def misses(p: Problem, at: Fit, change: Floats) -> Floats:
-    """All misses in sigmas, of points and of what is known, at a point that is moved: written out anew.
-
-    `change`: 6 of the pose, 1 of the focal length's fault, 7 of the lens, 9 of each bar.
-    """
+    """All misses in sigmas, written anew; change: 6 of the pose, a focal fault, 7 of the lens, 9 a bar."""
     z = at.lens + change[7:14]
     off = LENS.root(BENT) @ z
     f = BENT.focal_px + off[0]

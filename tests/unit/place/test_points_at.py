@@ -1,6 +1,4 @@
-"""A bar's image points between frames: their sigmas hold, in a still image, a moving and a shaken one; its
-point in the camera's axes, against drawn errors.
-"""
+"""A bar's image points between frames, with sigmas that hold; its point in the camera's axes."""
 
 import math
 from dataclasses import replace

@@ -36,10 +36,7 @@ BARS = [site_at(7, [-3.0, 45.0, 3.0], 4.0, 200.0), site_at(9, [3.0, 50.0, 4.0], 
 
 
 def views(rng, place_m, turn_deg, focal=0.0, bend_px=0.0, bars=BARS) -> list[CalibrationView]:
-    """A drive of 12 m towards the bars; poses are off by one error in common, and by one each.
-
-    Bars look bent along themselves, each by the same in all views.
-    """
+    """A drive of 12 m towards bars that look bent; poses are off by one error in common, and by one each."""
     place = np.linspace(-1, 1, 16)
     square = place**2 - (place**2).mean()
     bends = rng.normal(0, bend_px, len(bars))[:, None] * square / np.linalg.norm(square)

@@ -1,6 +1,4 @@
-"""The track against dense solutions and fine steps of its model; on simulated drives its sigmas are true, and
-so are the errors that it shows.
-"""
+"""The track against dense solutions and fine steps of its model; on drives its sigmas and errors are true."""
 
 import dataclasses
 import math
@@ -49,10 +47,7 @@ def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
 
 
 def disturbed(rng: np.random.Generator, count: int) -> list[Fix]:
-    """Fixes at uneven times with noise, errors of a memory and standing errors, anywhere: all is linear.
-
-    Of three bars in turn, two at a time, and the camera; they move fixes more and less along a drive.
-    """
+    """Fixes anywhere at uneven times, of the camera and two of three bars in turn, with all their errors."""
     found = []
     for t_s in np.cumsum(rng.uniform(0.01, 0.2, count)):
         seen = ["camera", *(f"bar {i}" for i in range(3) if abs(t_s - 0.5 * i) < 0.6)]
@@ -64,10 +59,7 @@ def disturbed(rng: np.random.Generator, count: int) -> list[Fix]:
 
 
 def dense(fixes: list[Fix], names: list[str]) -> tuple[Floats, Floats, Floats]:
-    """All states of all times, and all standing errors, by one weighted least-squares problem.
-
-    Means (n, 9), covariances of the positions (n, 3, 3), and the standing errors' means.
-    """
+    """States (n, 9), covariances of places (n, 3, 3) and standing errors, by one least-squares problem."""
     n = len(fixes)
     size = 9 * n + 2 * len(names)
     rows, right = [], []
@@ -158,10 +150,7 @@ def test_a_bar_long_out_of_sight_is_forgotten() -> None:
 
 
 def swayed(rng: np.random.Generator, fixes: int) -> tuple[list[Fix], Floats]:
-    """Fixes of a drive, whose standing errors of a metre move them by what depends on the place, and places.
-
-    What a fix says of that is as of where it is, noise included.
-    """
+    """Fixes, and places, of a drive; standing errors of a metre move each as of where it is, with noise."""
     t_s, along, noise_m = 0.04 * np.arange(fixes), np.array([1.0, 0.0, 0.0]), 0.1
     place = rng.normal(0, 1, 3) + np.outer(t_s, [2.0, 8.0, 0.0])
     base, slope = rng.normal(0, 0.6, (3, 6)), rng.normal(0, 0.12, (3, 6))

@@ -1,7 +1,4 @@
-"""A scorer in plain loops, for any link whose lengths are given by hand; and receivers that make faults.
-
-It shares nothing with the SDK: it reads the JSON of a truth and rows of text.
-"""
+"""A scorer in plain loops that shares nothing with the SDK, and receivers that make faults."""
 
 import math
 from dataclasses import dataclass

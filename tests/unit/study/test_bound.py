@@ -60,11 +60,7 @@ def view_of(
     blur_px: float = 0.45, upside_down: bool = False, across: bool = False, dark: tuple[int, ...] = (),
     moves_px: float = 0.0, by_sign_px: float = 0.0, noisier: float = 1.0,
 ) -> FrameView:  # fmt: skip
-    """A frame of a bar of `COLUMNS` pixels: the model's values and Gaussian noise, `FULL` events a value.
-
-    In each value the bar has moved by chance, `moves_px`; steps up and down are shifted against each other;
-    rows away from steps are `noisier`.
-    """
+    """A frame of a bar of `COLUMNS` pixels: the model's values and Gaussian noise, `FULL` events a value."""
     spacing, symbols = LINK.camera.focal_px * 0.06 / distance_m, rng.integers(0, 64, K)
     height, width = 2 * int(spacing * K / 2 + 8), 20
     book = LINK.codebook

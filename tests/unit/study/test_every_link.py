@@ -183,10 +183,7 @@ def received(scene: Scene) -> Tally:
 
 @pytest.mark.parametrize(
     ("settings", "says"),
-    [
-        ({"bar.rows": 48}, "bar.rows: sent with 96, received with 48"),
-        ({"error-correction.id": "none"}, None),
-    ],
+    [({"bar.rows": 48}, "bar.rows: sent with 96, received with 48"), ({"error-correction.id": "none"}, None)],
 )
 def test_another_link_is_refused_by_all(settings, says, evlcp, tmp_path) -> None:
     raw, campaign = tmp_path / "r.raw", tmp_path / "c.toml"
