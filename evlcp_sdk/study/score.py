@@ -5,12 +5,12 @@ bits wrong. The road score knows what a road adds: rows that are declared reflec
 that is not given is erased and no error, and one of a hidden cluster is claimed.
 """
 
-import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import InputError
+from evlcp_sdk.formatting import number_or_none
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.link.shared import differences
 from evlcp_sdk.plugin.records import SUMMARY
@@ -64,30 +64,26 @@ def _figures(bar: Statistics, *, road: bool) -> dict[str, Any]:
         "frames_found": tally.frames_found,
         "bit_errors": counted.bit_errors,
         "bits": counted.bits,
-        "ber": _rounded(counted.ber, 6),
-        "erased": _rounded(tally.erased_share, 5),
-        "claimed": _rounded(tally.claimed_share, 5),
-        "rmse_m": _rounded(tally.rmse_m, 4),
-        "bias_m": _rounded(tally.bias_m, 4),
-        "worst_m": _rounded(tally.worst_m, 3),
-        "nees": _rounded(tally.nees, 2),
+        "ber": number_or_none(counted.ber, 6),
+        "erased": number_or_none(tally.erased_share, 5),
+        "claimed": number_or_none(tally.claimed_share, 5),
+        "rmse_m": number_or_none(tally.rmse_m, 4),
+        "bias_m": number_or_none(tally.bias_m, 4),
+        "worst_m": number_or_none(tally.worst_m, 3),
+        "nees": number_or_none(tally.nees, 2),
         "ranged": tally.ranged,
-        "over_half_metre": _rounded(tally.gross_share, 4),
+        "over_half_metre": number_or_none(tally.gross_share, 4),
         "segments": {
             f"{start}-{start + SEGMENT_M}m": {
                 "n": tally.ranged,
-                "rmse_m": _rounded(tally.rmse_m, 4),
-                "bias_m": _rounded(tally.bias_m, 4),
+                "rmse_m": number_or_none(tally.rmse_m, 4),
+                "bias_m": number_or_none(tally.bias_m, 4),
             }
             for start, tally in bar.segments.items()
             if tally.ranged and 0 <= start < _FARTHEST_M
         },
     }
     return {key: value for key, value in figures.items() if road or key not in _OF_ROADS}
-
-
-def _rounded(value: float, digits: int) -> float | None:
-    return None if math.isnan(value) else round(value, digits)
 
 
 def links_of_result(folder: Path | str, registry: Registry | None = None) -> dict[str, Link]:
