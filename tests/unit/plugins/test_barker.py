@@ -14,7 +14,7 @@ from evlcp_sdk.air.codebook import BARKER13, Codebook, chips_of_values
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError
 
-CHIP_US = 100.0
+CHIP_US, START_US = 100.0, 5000.0
 
 
 def correlate(counts, chips, due, steps, min_events, lags):
@@ -29,16 +29,12 @@ def correlate(counts, chips, due, steps, min_events, lags):
     return rho
 
 
-def events_of(
-    chips, rng, start_us=5000.0, ppm=0.0, delay_us=(20.0, 45.0), missing_off=0.0, per_edge=2, jitter_us=4.0
-):
-    """(times, polarities) of clusters that blink as `chips` (n, K): each edge sends a few late events."""
+def events_of(chips, rng, start_us=START_US, *, ppm=0.0, delay_us=(20.0, 45.0), missing_off=0.0):
+    """(times, polarities) of clusters that blink as `chips` (n, K): each edge sends two late events."""
     edges = np.diff(chips.astype(int), axis=0, prepend=0)
-    when, cluster = (np.repeat(v, per_edge) for v in np.nonzero(edges))
+    when, cluster = (np.repeat(v, 2) for v in np.nonzero(edges))
     p = (edges[when, cluster] > 0).astype(np.uint8)
-    late = (
-        np.where(p, *delay_us) + 12 * (np.arange(len(when)) % per_edge) + rng.normal(0, jitter_us, len(when))
-    )
+    late = np.where(p, *delay_us) + 12 * (np.arange(len(when)) % 2) + rng.normal(0, 4.0, len(when))
     t = np.floor(start_us + when * CHIP_US * (1 + ppm * 1e-6) + late).astype(np.int64)
     keep = (p > 0) | (rng.random(len(t)) >= missing_off)
     order = np.argsort(t[keep], kind="stable")
@@ -59,7 +55,7 @@ def answers_of(chips, slow):
     return counts
 
 
-CLUSTERS, FRAMES, START_US = 16, 10, 5000.0
+CLUSTERS, FRAMES = 16, 10
 
 
 def book_of(preamble, clusters=CLUSTERS):
@@ -218,7 +214,7 @@ def test_a_preamble_of_sparse_pulses_is_one_lock_a_packet():
     book = Codebook("sparse", code, slots[places].reshape(12, -1), words.reshape(25, -1))
     packet = PacketFormat.of(book, 7)
     rng = np.random.default_rng(0)
-    events = events_of(packets_of(rng, 4, book, 7), rng, START_US)
+    events = events_of(packets_of(rng, 4, book, 7), rng)
     locks, _ = locks_of(*events, BarkerSync().compile(book, packet))
     apart = packet.packet_chips * CHIP_US
     assert_allclose([lock.packet_t_us for lock in locks], START_US + apart * np.arange(4), atol=50)
@@ -230,7 +226,7 @@ def test_a_preamble_of_sparse_pulses_is_one_lock_a_packet():
 @pytest.mark.parametrize(("ppm", "delay_us"), [(-50, (20, 45)), (0, (45, 20)), (50, (60, 10))])
 def test_packet_start_clock_and_delays(ppm, delay_us):
     rng = np.random.default_rng(ppm + 50)
-    events = events_of(packets_of(rng, 12), rng, START_US, ppm=ppm, delay_us=delay_us, missing_off=0.2)
+    events = events_of(packets_of(rng, 12), rng, ppm=ppm, delay_us=delay_us, missing_off=0.2)
     locks, _ = locks_of(*events)
     assert len(locks) == 12
     start = START_US + delay_us[0] + PERIOD_US * (1 + ppm * 1e-6) * np.arange(12)
@@ -253,7 +249,7 @@ def test_packet_start_clock_and_delays(ppm, delay_us):
 
 def test_a_lock_does_not_wait_for_the_next_packet():
     rng, sync = np.random.default_rng(3), BarkerSync().compile(BOOK, FORMAT)
-    t, p = events_of(packets_of(rng, 4), rng, START_US, ppm=30, missing_off=0.2)
+    t, p = events_of(packets_of(rng, 4), rng, ppm=30, missing_off=0.2)
     # The preamble, the guard of the peak behind it, and one step.
     until_us = int(START_US + (26 + 3 + 2) * CHIP_US)
     _, locks = sync.step(sync.init(), t[t < until_us], p[t < until_us], until_us)
@@ -276,7 +272,7 @@ def test_a_flash_is_no_preamble(events):
 
 def test_the_lock_is_kept_across_missing_preambles():
     rng = np.random.default_rng(5)
-    t, p = events_of(packets_of(rng, 14), rng, START_US, ppm=-40)
+    t, p = events_of(packets_of(rng, 14), rng, ppm=-40)
     number = (t - START_US) / PERIOD_US
     hidden = (number > 4.9) & (number < 9.5)
     locks, state = locks_of(t[~hidden], p[~hidden])
@@ -289,10 +285,8 @@ def test_the_lock_is_kept_across_missing_preambles():
 @pytest.mark.parametrize("jump_us", [1_234, 17_300, -9_000])
 def test_the_second_preamble_after_a_jump_is_believed(jump_us):
     rng = np.random.default_rng(7)
-    chips = packets_of(rng, 9)
-    cut = 4 * FORMAT.packet_chips
-    before = events_of(chips[:cut], rng, START_US)
-    after = events_of(chips[cut:], rng, START_US + 5 * PERIOD_US + jump_us)
+    before = events_of(packets_of(rng, 4), rng)
+    after = events_of(packets_of(rng, 5), rng, START_US + 5 * PERIOD_US + jump_us)
     locks, state = locks_of(*(np.concatenate(c) for c in zip(before, after, strict=True)))
     want = np.r_[0:4, 6:10] + np.r_[np.zeros(4), np.full(4, jump_us / PERIOD_US)]
     assert_allclose(numbers(locks), want, atol=2e-3)
@@ -307,7 +301,7 @@ def test_the_second_preamble_after_a_jump_is_believed(jump_us):
 @pytest.mark.parametrize("packets", [(1.9, 3.9), (3.9, 4.9), (4.9, 20)])
 def test_latency_is_no_clock(ppm, by_us, packets):
     rng = np.random.default_rng(9)
-    t, p = events_of(packets_of(rng, 12), rng, START_US, ppm=ppm, missing_off=0.2)
+    t, p = events_of(packets_of(rng, 12), rng, ppm=ppm, missing_off=0.2)
     number = (t - START_US) / PERIOD_US
     late = t + by_us * ((number > packets[0]) & (number < packets[1]))
     order = np.argsort(late, kind="stable")
@@ -329,7 +323,7 @@ def test_latency_is_no_clock(ppm, by_us, packets):
 @pytest.mark.parametrize("ppm", [-400, 400])
 def test_the_clock_tolerance_is_a_bound(ppm, tolerance_ppm):
     rng = np.random.default_rng(11)
-    t, p = events_of(packets_of(rng, 10), rng, START_US, ppm=ppm)
+    t, p = events_of(packets_of(rng, 10), rng, ppm=ppm)
     locks, _ = locks_of(t, p, BarkerSync(clock_tolerance_ppm=tolerance_ppm).compile(BOOK, FORMAT))
     rates = 1e6 * (np.array([lock.chip_us for lock in locks]) / CHIP_US - 1)
     assert np.abs(rates).max() <= tolerance_ppm + 1e-6

@@ -41,26 +41,23 @@ def view_of(
     symbols = rng.integers(0, 64, K)
     codes = np.concatenate([PILOTS, WORDS[symbols]], axis=1)
     codes[list(dark)] = 0
-    chips = np.zeros((32, height, width))
     drift = motion_px * (np.arange(32) / 32 - 0.5)
     moved = np.rint(drift)
-    for c in range(1, 32, 2):
-        rows = np.arange(height) - (height - 1) / 2 - shift_px - (drift[c] - moved[c])
-        edges = step * (np.arange(K + 1) - K / 2)
-        cdf = norm.cdf((rows[:, None] - edges) / blur_px)
-        share = cdf[:, :-1] - cdf[:, 1:]
-        level = share @ codes[:, c // 2]
-        centre = (width - 1) / 2 + tilt * rows
-        inside = np.abs(np.arange(width) - centre[:, None]) <= 2
-        chips[c] = np.where(inside, 3 * level[:, None], 0) + noise * rng.normal(size=(height, width)) * inside
-    chips = np.rint(chips)
+    # Of second chips and rows.
+    rows = np.arange(height) - (height - 1) / 2 - shift_px - (drift - moved)[1::2, None]
+    cdf = norm.cdf((rows[:, :, None] - step * (np.arange(K + 1) - K / 2)) / blur_px)
+    level = np.einsum("crk,kc->cr", cdf[:, :, :-1] - cdf[:, :, 1:], codes)
+    centre = (width - 1) / 2 + tilt * rows
+    inside = np.abs(np.arange(width) - centre[:, :, None]) <= 2
+    chips = np.zeros((32, height, width))
+    chips[1::2] = np.rint(inside * (3 * level[:, :, None] + noise * rng.normal(size=inside.shape)))
+    # Cells of 2 px that a cluster covers.
+    row, cell = 2 * np.arange(height // 2)[:, None], np.arange(width // 2)
     middle = (height - 1) / 2 + shift_px + step * (np.arange(K) - (K - 1) / 2)
-    selected = np.zeros((K, height // 2, width // 2), bool)
-    for k in set(range(K)) - set(dark):
-        top, bottom = (middle[k] - step / 2 + 1) / 2, (middle[k] + step / 2 - 1) / 2
-        for r in range(int(np.ceil(top)), int(bottom) + 1):
-            column = ((width - 1) / 2 + tilt * (2 * r - (height - 1) / 2)) / 2
-            selected[k, r, int(column - 1) : int(column + 1) + 1] = True
+    column = ((width - 1) / 2 + tilt * (row - (height - 1) / 2)) / 2
+    selected = np.abs(row - middle[:, None, None]) <= step / 2 - 1
+    selected = selected & (np.abs(cell - np.floor(column)) <= 1)
+    selected[list(dark)] = False
     offset = np.stack([np.zeros(32), drift - moved])
     if upside_down:
         chips, selected, offset = chips[:, ::-1], selected[:, ::-1], -offset

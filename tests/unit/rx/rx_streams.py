@@ -7,9 +7,16 @@ import numpy as np
 
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.values import Events
 
 LINK = load_link()
+
+
+def lit(packets, seed=0, link=LINK, **how):
+    """A bar that sends so many random packets, and its events."""
+    bar = IdealBar(random_symbols(link, packets, seed), **how)
+    return bar, ideal_events(link, bar, seed=seed)
 
 
 def received(link, events, cuts=(), **options):

@@ -1,13 +1,15 @@
-"""Packet grids against a walk through the chips on air; delays by row, on bars whose rows come late."""
+"""Packet grids against a walk through the chips on air; delays by row; sums by chips of what is seen."""
 
 from itertools import takewhile
 
 import numpy as np
 import pytest
 from hypothesis import assume, given, strategies as st
-from rx_streams import LINK, frames_of, noise_events, received
+from numpy.testing import assert_allclose, assert_array_equal
+from rx_streams import LINK, frames_of, lit, noise_events, received
 
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.rx.alignment import polarity_sums
 from evlcp_sdk.rx.transmitters import PacketGrid, RowDelay, measure_row_delay
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, SyncLock
@@ -55,17 +57,15 @@ def test_frames_are_due_as_they_are_on_air(form, heard, earliest_us, until_us):
     sent = on_air(form, 60)
     assume(all(abs(f[2] - earliest_us) > 1e-3 and abs(f[3] - until_us) > 1e-3 for f in sent))
     want = list(takewhile(lambda f: f[3] <= until_us, (f for f in sent if f[2] >= earliest_us)))
-    assert [d.index for d in found] == [f[1] for f in want]
-    assert [d.start_us for d in found] == pytest.approx([f[2] for f in want], abs=1e-6)
-    assert [d.end_us for d in found] == pytest.approx([f[3] for f in want], abs=1e-6)
-    assert [d.number for d in found] == list(range(grid.frame - len(found), grid.frame))
-    for due, (packet, index, _, _) in zip(found, want, strict=True):
+    for due, (packet, index, *frame_us) in zip(found, want, strict=True):
         packet_us = ZERO_US + packet * form.packet_chips * CHIP_US
-        assert due.packet_us == pytest.approx(packet_us, abs=1e-6)
+        assert (due.packet_us, due.start_us, due.end_us) == pytest.approx((packet_us, *frame_us), abs=1e-6)
+        assert due.index == index
         assert due.number == due.packet * form.frames + index
         assert due.has_pilot == (index % form.pilot_every == 0)
-    # Every packet has its own number, counted up.
-    assert [d.packet - found[0].packet for d in found] == [f[0] - want[0][0] for f in want]
+        # Every packet has its own number, counted up.
+        assert due.packet - found[0].packet == packet - want[0][0]
+    assert [d.number for d in found] == list(range(grid.frame - len(found), grid.frame))
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -110,12 +110,11 @@ def test_a_lock_near_the_grid_moves_it_and_another_begins_anew(form, late_us):
 
 # Rows that come late
 
-CHIPS = LINK.codebook.preamble * 2.0 - 1
-BAR = IdealBar(random_symbols(LINK, 2), cluster_px=12.0)
+PREAMBLE = LINK.codebook.preamble * 2.0 - 1
+BAR, EVENTS = lit(2, cluster_px=12.0)
 HEIGHT_PX = 16 * 12.0
 # Events of a rising edge come 20 to 44 us late, of a falling one 40 to 64: the windows' middles are there.
-LOCK = SyncLock(BAR.start_us, 100.0, 32.0 - 50.0, 52.0 - 50.0, 0.9)
-EVENTS = ideal_events(LINK, BAR)
+BAR_LOCK = SyncLock(BAR.start_us, 100.0, 32.0 - 50.0, 52.0 - 50.0, 0.9)
 
 
 def read_late(events, row_us, centre_px=BAR.y_px):
@@ -125,7 +124,7 @@ def read_late(events, row_us, centre_px=BAR.y_px):
 
 
 def measured(events, height_px=HEIGHT_PX):
-    return measure_row_delay(CHIPS, LOCK, [(0, events)], BAR.y_px, height_px)
+    return measure_row_delay(PREAMBLE, BAR_LOCK, [(0, events)], BAR.y_px, height_px)
 
 
 @pytest.mark.parametrize("row_us", [-0.3, 0.0, 0.1, 0.5])
@@ -170,3 +169,71 @@ def test_the_receiver_reads_a_bar_whose_ends_are_a_chip_apart(row_us):
     packet = (number // LINK.packet.packet_chips).astype(int)
     wrong = bar.symbols[packet, [f.frame for f in frames]] != [f.soft.symbols for f in frames]
     assert wrong.mean() < 0.002
+
+
+CHIPS, SIZE = 12, (8, 14)
+LOCK = SyncLock(packet_t_us=0, chip_us=100.25, delay_on_us=-20.5, delay_off_us=33.75, quality=1)
+STILL = np.repeat([[103.5], [206.5]], CHIPS, axis=1)
+
+
+def stream(seed, n=4000):
+    rng = np.random.default_rng(seed)
+    t = np.sort(rng.integers(900, 2500, n))
+    return Events.of(t, rng.integers(98, 110, n), rng.integers(198, 216, n), rng.integers(0, 2, n))
+
+
+def plain_sums(events, start_on_us, start_off_us, chip_us, shift_x, shift_y, shape):
+    sums = np.zeros(shape, np.int16)
+    start = np.where(events.p > 0, start_on_us, start_off_us)
+    chip = np.floor((events.t_us - start) / chip_us).astype(int)
+    inside = (chip >= 0) & (chip < shape[0])
+    chip, events = chip[inside], events[inside]
+    u, v = events.x.astype(int) - shift_x[chip], events.y.astype(int) - shift_y[chip]
+    seen = (u >= 0) & (u < shape[2]) & (v >= 0) & (v < shape[1])
+    np.add.at(sums, (chip[seen], v[seen], u[seen]), np.where(events.p[seen] > 0, 1, -1))
+    return sums
+
+
+def one(t_us, p, x=103, y=206):
+    return Events.of([t_us], [x], [y], [p])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_moving_bar_is_held_in_the_middle(seed):
+    rng = np.random.default_rng(seed)
+    centre = np.array([[104], [207]]) + rng.uniform(-5, 5, (2, CHIPS))
+    events = stream(seed)
+    sums, offset = polarity_sums([events], LOCK, 1000.0, centre, SIZE)
+    assert np.abs(offset).max() <= 0.5
+    # Column 0 of the image is this column of the sensor.
+    left, top = (c - o - (n - 1) / 2 for c, o, n in zip(centre, offset, SIZE, strict=True))
+    assert_allclose(np.rint([left, top]), [left, top], atol=1e-9)
+    shape = (CHIPS, SIZE[1], SIZE[0])
+    shifts = (np.rint(s).astype(int) for s in (left, top))
+    want = plain_sums(events, 1000 - 20.5, 1000 + 33.75, LOCK.chip_us, *shifts, shape)
+    assert_array_equal(sums, want)
+    assert sums.dtype == np.int16
+
+
+@pytest.mark.parametrize(("p", "delay_us"), [(1, -20.5), (0, 33.75)])
+def test_each_polarity_has_its_own_first_and_last_chip(p, delay_us):
+    first = 1000 + delay_us
+    end = first + CHIPS * LOCK.chip_us
+    for t, chip in [
+        (np.ceil(first) - 1, None),
+        (np.ceil(first), 0),
+        (np.ceil(end) - 1, CHIPS - 1),
+        (np.ceil(end), None),
+    ]:
+        sums, _ = polarity_sums([one(int(t), p)], LOCK, 1000.0, STILL, SIZE)
+        want = [] if chip is None else [[chip, 6, 3]]
+        assert np.argwhere(sums).tolist() == want, f"event at {t}"
+        assert sums.sum() == (0 if chip is None else 2 * p - 1)
+
+
+def test_no_events_are_no_sums():
+    for pieces in ([], [Events.empty()], [Events.empty(), one(10**9, 1), one(10**9, 0)]):
+        sums, offset = polarity_sums(pieces, LOCK, 1000.0, STILL, SIZE)
+        assert sums.shape == (CHIPS, SIZE[1], SIZE[0])
+        assert offset.shape == (2, CHIPS)
+        assert not sums.any()

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rx_streams import lit
 
 from evlcp_sdk.errors import ConfigError, InputError, PluginError, PluginWarning
 from evlcp_sdk.io import open_source
@@ -14,11 +15,10 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Corrected, Tracker
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.values import Bend, SyncLock
 
 LINK = load_link(overrides=["tracking.id=kalman"])
-EVENTS = ideal_events(LINK, IdealBar(random_symbols(LINK, 2)))
+_, EVENTS = lit(2)
 ROLES = ("synchronization", "separation", "decoding", "ranging", "tracking")
 
 

@@ -40,12 +40,11 @@ def test_hits_of_a_cell_stop_at_what_they_hold(before):
 @pytest.mark.parametrize("chip_us", [50.0, 100.0, 333.3, 1e5, 2e6])
 def test_times_count_alike_at_every_chip_rate(chip_us):
     """A clock of ticks longer than a microsecond serves slow chips."""
+    start_us, pixels = 5_000_000_000_000, np.zeros((HEIGHT, WIDTH), np.uint32)
     for chips, score in ((2, 2), (4.2, 2), (5, 1), (7, -2), (7.5, -3), (12, 1), (14, -1)):
-        pixels = np.zeros((HEIGHT, WIDTH), np.uint32)
         rhythm = rhythm_of(pixels, chip_us)
-        start_us = 5_000_000_000_000
-        pixels[:] = states(start_us >> rhythm._shift, 9, 10)
         rhythm._seen = start_us >> rhythm._shift
+        pixels[:] = states(rhythm._seen, 9, 10)
         rise = Events.of([start_us + round(chips * chip_us)], [3], [2], [1])
         rhythm.step(start_us, rise, np.zeros((4, 6), np.int16), 2)
         assert pixels[2, 3] & _kernels.SCORES == 10 + score, chips

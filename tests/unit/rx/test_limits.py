@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from rx_streams import LINK, frames_of, noise_events, steps
+from rx_streams import LINK, frames_of, lit, noise_events, steps
 
 from evlcp_sdk.clock import Timeline
 from evlcp_sdk.link.sections import RegionSpec
@@ -14,7 +14,7 @@ from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.regions import EVENT_BYTES, PIECE_BYTES, RegionFollower
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
+from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import Events
 
 SPEC = RegionSpec(step_us=1000)
@@ -24,8 +24,8 @@ KEEP_US = 20_000
 def blobs(columns, rows, until_us):
     """Blobs of 9 px in a grid of 60 px, each with a code of its own."""
     places = product(range(15, 60 * columns, 60), range(15, 60 * rows, 60))
-    bars = (IdealBar(random_symbols(LINK, 4, k), *at, 9 / 16, 3, start_us=0) for k, at in enumerate(places))
-    found = merged(*(ideal_events(LINK, bar) for bar in bars))
+    small = {"cluster_px": 9 / 16, "width_px": 3, "start_us": 0}
+    found = merged(*(lit(4, k, x_px=x, y_px=y, **small)[1] for k, (x, y) in enumerate(places)))
     return found[: found.t_us.searchsorted(until_us)]
 
 
@@ -114,14 +114,14 @@ def test_a_region_that_had_its_time_gives_way():
 def test_of_many_areas_those_with_the_most_rises_are_looked_at():
     dim = blobs(8, 5, 40_000)
     dim = dim[np.random.default_rng(2).random(len(dim)) < 0.6]
-    bar = ideal_events(LINK, IdealBar(random_symbols(LINK, 2), x_px=900))
+    _, bar = lit(2, x_px=900)
     *_, regions = stepped(merged(dim, bar[: np.searchsorted(bar.t_us, 40_000)]), 40_000, areas=4)
     assert regions.counts["areas_left_out"] > 0
     assert any(abs(one.latest.x_px - 900) < 5 for one in regions.alive)
 
 
 def test_within_the_defaults_nothing_is_left_out():
-    bar = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1), x_px=700))
+    _, bar = lit(3, 1, x_px=700)
     events = merged(blobs(2, 4, 120_000), bar, noise_events(1.7e6, 120_000))
     receiver = Receiver(LINK)
     assert len(frames_of(receiver.feed(events))) >= 10

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
-from rx_streams import LINK, frames_of, noise_events, received, right_frames, said
+from rx_streams import LINK, frames_of, lit, noise_events, received, right_frames, said
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import load_link
@@ -17,10 +16,6 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, PresenceMap, changed
-
-
-def packets_of(bar, link=LINK):
-    return received(link, ideal_events(link, bar))[1]
 
 
 @pytest.mark.parametrize(
@@ -42,8 +37,8 @@ def test_every_link_is_read_to_the_last_frame(sets, ppm):
     link = load_link(overrides=sets.split())
     every = link.packet.pilot_every
     # Where pilots are few it moves by a spacing while one of eight frames holds.
-    bar = IdealBar(random_symbols(link, 5), ppm=ppm, shake_px=16 if every > 1 else 0, shake_hz=10)
-    packets = packets_of(bar, link)
+    bar, events = lit(5, link=link, ppm=ppm, shake_px=16 if every > 1 else 0)
+    _, packets = received(link, events)
     assert right_frames(packets, bar, link) == 5 * link.packet.frames
     assert [p.packet for p in packets] == [0, 1, 2, 3, 4]
     # Two packets of 2 us jitter tell the rate to 40 ppm, five to 20.
@@ -56,8 +51,8 @@ def test_every_link_is_read_to_the_last_frame(sets, ppm):
 def test_frames_before_the_first_preamble_are_decoded(every, start_us, first):
     """Those that began in the recording, and of few pilots those whose pilot did."""
     link = load_link(overrides=[f"air.pilot_every={every}"])
-    bar = IdealBar(random_symbols(link, 3), start_us=start_us)
-    packets = packets_of(bar, link)
+    bar, events = lit(3, link=link, start_us=start_us)
+    _, packets = received(link, events)
     assert [f.frame for f in packets[0].frames] == list(range(first, 10))
     assert right_frames(packets, bar, link) == 30 - first
 
@@ -83,22 +78,20 @@ def frame_chip(link, packet, frame):
 def test_a_bar_in_the_dark(every, first, end, given_, count):
     """A dark pilot takes its frames with it; a bar out of sight is not rejected; each says why."""
     link = load_link(overrides=[f"air.pilot_every={every}"])
-    bar = IdealBar(random_symbols(link, 3))
-    events = ideal_events(link, bar)
+    bar, events = lit(3, link=link)
     chips = [frame_chip(link, 1, frame) + more for frame, more in (first, end)]
     probe = Probe(list)
-    hook = Registry.load(probe).hook
-    receiver, packets = received(link, events[~between(events, bar, *chips)], hook=hook)
+    seen = events[~between(events, bar, *chips)]
+    receiver, packets = received(link, seen, hook=Registry.load(probe).hook)
     assert [f.frame for f in packets[1].frames] == given_
     why = next(name for name, many in count.items() if many)
     missing = [n for n in range(10) if n not in given_]
     skipped = [one for one in probe["skipped"] if isinstance(one, SkippedFrame)]
-    assert [(one.transmitter, one.packet, one.frame, one.why) for one in skipped] == [
-        (0, 1, n, why) for n in missing
-    ]
+    where = [(one.transmitter, one.packet, one.frame, one.why) for one in skipped]
+    assert where == [(0, 1, n, why) for n in missing]
     starts_us = [bar.start_us + 100 * frame_chip(link, 1, n) for n in missing]
     # To a quarter of a chip.
-    assert_allclose([one.t_us for one in skipped], starts_us, atol=25)
+    assert [one.t_us for one in skipped] == pytest.approx(starts_us, abs=25)
     assert right_frames(packets, bar, link) == 20 + len(given_)
     assert {name: receiver.counts[name] for name in count} == count
 
@@ -117,9 +110,8 @@ def flashes(start_us, seed=7):
 )
 def test_a_step_of_light_costs_the_frame_that_it_drowns(drowned, start_us, which):
     """The bar has been where its trail lights up, too, and is not dragged back; nor before the first lock."""
-    bar = IdealBar(random_symbols(LINK, 4), shake_px=16, shake_hz=10, start_us=start_us)
+    bar, events = lit(4, shake_px=16, start_us=start_us)
     first_us = int(bar.start_us) + 100 * (frame_chip(LINK, *which) + LINK.packet.pilot_chips)
-    events = ideal_events(LINK, bar)
     lost = drowned & (events.t_us > first_us + 200) & (events.t_us < first_us + 1400)
     receiver, packets = received(LINK, merged(events[~lost], flashes(first_us)))
     frames = frames_of(packets)
@@ -144,8 +136,7 @@ def test_events_that_come_sooner_in_brighter_light(sooner_us):
 
 def test_a_bar_that_says_nothing_is_no_transmitter():
     """Preambles and pilots show its clusters; the info segments are dark."""
-    bar, packet = IdealBar(random_symbols(LINK, 2)), LINK.packet
-    events = ideal_events(LINK, bar)
+    (bar, events), packet = lit(2), LINK.packet
     dark = np.zeros(len(events), bool)
     for number in range(20):
         # The last edge of the pilot belongs to it.
@@ -161,8 +152,7 @@ def test_a_frame_that_the_end_cuts_is_not_given():
 
     One that is decoded before the stream ends there is counted.
     """
-    bar = IdealBar(random_symbols(LINK, 2))
-    events = ideal_events(LINK, bar)
+    bar, events = lit(2)
     end_us = bar.start_us + 100 * frame_chip(LINK, 1, 5)
     for after_us, found, cut in ((-50, 4, 0), (60, 4, 0), (220, 4, 1), (290, 5, 0), (1000, 5, 0)):
         receiver, packets = received(LINK, events[events.t_us < end_us + after_us])
@@ -174,8 +164,8 @@ def test_a_frame_that_the_end_cuts_is_not_given():
 @pytest.mark.parametrize(("shake_px", "shake_hz"), [(16, 15), (60, 15), (250, 5)])
 def test_a_bar_that_sweeps_from_the_first_frame_on(shake_px, shake_hz):
     """Round in a circle at 1.5, 5.7 and 7.9 px/ms: in any direction, along the bar and across it."""
-    bar = IdealBar(random_symbols(LINK, 4), shake_px=shake_px, shake_hz=shake_hz)
-    receiver, packets = received(LINK, ideal_events(LINK, bar))
+    bar, events = lit(4, shake_px=shake_px, shake_hz=shake_hz)
+    receiver, packets = received(LINK, events)
     assert right_frames(packets, bar) == 40
     assert receiver.counts["regions_opened"] == 1
     for f in frames_of(packets):
@@ -186,10 +176,11 @@ def test_a_bar_that_sweeps_from_the_first_frame_on(shake_px, shake_hz):
 @pytest.mark.parametrize("apart_px", [10, 14])
 def test_two_bars_a_few_pixels_apart_are_two(apart_px):
     """Each with a clock and a payload of its own."""
-    one = IdealBar(random_symbols(LINK, 3, seed=1), start_us=0)
-    two = IdealBar(random_symbols(LINK, 3, seed=2), start_us=12_345, x_px=one.x_px + apart_px, ppm=40)
-    _, packets = received(LINK, merged(ideal_events(LINK, one), ideal_events(LINK, two)))
-    for bar in (one, two):
+    bars, events = zip(
+        lit(3, 1, start_us=0), lit(3, 2, start_us=12_345, x_px=400.3 + apart_px, ppm=40), strict=True
+    )
+    _, packets = received(LINK, merged(*events))
+    for bar in bars:
         mine = [p for p in packets if abs(p.frames[0].x_px - bar.x_px + 0.5) < 1]
         assert len({p.transmitter for p in mine}) == 1
         assert len(frames_of(mine)) >= 28
@@ -197,8 +188,7 @@ def test_two_bars_a_few_pixels_apart_are_two(apart_px):
 
 def test_random_blinking_at_the_chip_rate_is_no_transmitter():
     rng = np.random.default_rng(5)
-    chips = np.repeat(rng.integers(0, 2, (1500, 1)), 64 * 4, axis=1)
-    edges = np.diff(chips, axis=0, prepend=0)
+    edges = np.diff(rng.integers(0, 2, 1500), prepend=0)[:, None] * np.ones(64 * 4, int)
     when, pixel = np.nonzero(edges)
     t = when * 100 + rng.integers(20, 60, len(when))
     events = merged(Events.of(t, 300 + pixel % 4, 200 + pixel // 4, edges[when, pixel] > 0))
@@ -207,11 +197,10 @@ def test_random_blinking_at_the_chip_rate_is_no_transmitter():
 
 def test_a_dark_cluster_costs_only_itself():
     """And the distance is that of the spacing."""
-    bar = IdealBar(random_symbols(LINK, 2), cluster_px=9.0)
-    events = ideal_events(LINK, bar)
+    bar, events = lit(2, cluster_px=9.0)
     top = 350.7 - 72 + 5 * 9
-    lit = (events.y < np.floor(top)) | (events.y > np.ceil(top + 9))
-    for kept, px, rel in ((lit, 5, 5e-3), (lit | True, [], 2e-3)):
+    shown = (events.y < np.floor(top)) | (events.y > np.ceil(top + 9))
+    for kept, px, rel in ((shown, 5, 5e-3), (shown | True, [], 2e-3)):
         frames = frames_of(received(LINK, events[kept])[1])
         assert len(frames) == 20
         for f, want in zip(frames, bar.symbols.reshape(-1, 16), strict=True):
@@ -224,8 +213,7 @@ def test_a_dark_cluster_costs_only_itself():
 def test_a_bar_in_pieces_too_small_to_place_is_put_together():
     """Three pieces of four clusters: each hears the preamble, and none shows so many that they are sure."""
     hidden = [4, 5, 10, 11]
-    bar = IdealBar(random_symbols(LINK, 2, seed=3), start_us=0, cluster_px=12)
-    events = ideal_events(LINK, bar)
+    bar, events = lit(2, 3, start_us=0, cluster_px=12)
     cluster = (events.y - (bar.y_px - 8 * 12)) // 12
     frames = frames_of(received(LINK, events[~np.isin(cluster, hidden)])[1])
     sent = bar.symbols.reshape(-1, 16).copy()
@@ -236,8 +224,7 @@ def test_a_bar_in_pieces_too_small_to_place_is_put_together():
 
 
 def test_a_bar_lost_from_sight_goes_on_as_the_same():
-    bar = IdealBar(random_symbols(LINK, 6), ppm=30)
-    events = ideal_events(LINK, bar)
+    bar, events = lit(6, ppm=30)
     hidden = (events.t_us >= 80_000) & (events.t_us < 150_000)
     moved = Events.of(events.t_us, events.x + np.where(events.t_us < 150_000, 0, 70), events.y, events.p)
     _, packets = received(LINK, moved[~hidden])
@@ -251,18 +238,13 @@ def test_a_bar_lost_from_sight_goes_on_as_the_same():
 def test_a_transmitter_that_starts_anew_is_another(at_us):
     """In the middle of a packet, with another clock, and again: read from its first whole frame on.
 
-    Also where its frames stand on the old grid for a part of each packet.
-
-    Or from the second, where one that was cut short is given until then.
+    Also where its frames stand on the old grid for a part of each packet; or from the second, where one that
+    was cut short is given until then.
     """
-    bars = [
-        IdealBar(random_symbols(LINK, 6, seed), start_us=start_us, ppm=ppm)
-        for seed, start_us, ppm in ((1, 5000, -60), (2, at_us - 13_210, 80), (3, at_us + 90_000, 0))
-    ]
+    starts = (5000, -60), (at_us - 13_210, 80), (at_us + 90_000, 0)
+    bars, sent = zip(*(lit(6, k, start_us=us, ppm=ppm) for k, (us, ppm) in enumerate(starts)), strict=True)
     begins = 0, at_us, at_us + 100_000, 300_000
-    sent = [ideal_events(LINK, bar) for bar in bars]
-    lit = [(e.t_us >= begins[i]) & (e.t_us < begins[i + 1]) for i, e in enumerate(sent)]
-    events = merged(*(e[on] for e, on in zip(sent, lit, strict=True)))
+    events = merged(*(e[slice(*e.t_us.searchsorted(begins[k : k + 2]))] for k, e in enumerate(sent)))
     # The camera is said to lean, which every frame that is read contradicts.
     receiver, packets = received(LINK, events, attitude=Attitude(6.0, 5.0))
     assert receiver.counts["restarts"] == 2
@@ -280,8 +262,8 @@ def test_a_transmitter_that_starts_anew_is_another(at_us):
 
 
 STREAM = merged(
-    ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 3), shake_px=5, ppm=35), seed=3),
-    ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 4), x_px=800, start_us=9000, cluster_px=5), seed=4),
+    lit(3, 3, shake_px=5, ppm=35)[1],
+    lit(3, 4, x_px=800, start_us=9000, cluster_px=5)[1],
     noise_events(30_000, 130_000),
 )
 
@@ -352,8 +334,7 @@ class Probe(defaultdict):
 def test_probes_see_every_stage(width_px):
     """A thin bar stands in the middle of a cell."""
     probe = Probe(list)
-    bar = IdealBar(random_symbols(LINK, 2), width_px=width_px, x_px=400.0)
-    received(LINK, ideal_events(LINK, bar), hook=Registry.load(probe).hook)
+    received(LINK, lit(2, width_px=width_px, x_px=400.0)[1], hook=Registry.load(probe).hook)
     assert {len(probe[stage]) for stage in ("frame", "ranging", "decoding", "view")} == {20}
     assert len(probe["synchronization"]) == 2
     assert len(probe["regions"]) >= 40

@@ -5,12 +5,12 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-from rx_streams import LINK, frames_of, received
+from rx_streams import LINK, frames_of, lit, received
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.reflections import FrameDetection, Reflections, repeats
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
+from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import Events, Frame, Range, SoftSymbols
 
 FORMAT = PacketFormat()
@@ -168,8 +168,7 @@ def test_memory_is_bounded():
         assert len(echoes._pairs) <= 3 + 2 * 8
 
 
-BAR = IdealBar(random_symbols(LINK, 3), shake_px=2.0)
-OWN = ideal_events(LINK, BAR)
+_, OWN = lit(3, shake_px=2.0)
 
 
 def test_a_rail_shows_the_bar_again():

@@ -1,10 +1,10 @@
-"""Finding and following blinking regions."""
+"""Finding and following blinking regions; lines of events that move, drawn from a known place and speed."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from rx_streams import LINK, lamp_events, noise_events, steps
+from rx_streams import LINK, lamp_events, lit, noise_events, steps
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
@@ -12,14 +12,14 @@ from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.boxes import clear_of, cut_off
 from evlcp_sdk.rx.regions import Places, RegionFollower, ShownPlace
 from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.rx.sweeps import find_sweeps, fit_sweep, with_chips
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
+from evlcp_sdk.testing.recordings import ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events
 
 SPEC = RegionSpec(step_us=1000)
 STEP_US = SPEC.step_us
-BAR = IdealBar(random_symbols(LINK, 2), start_us=0)
-BAR_EVENTS = ideal_events(LINK, BAR)
+BAR, BAR_EVENTS = lit(2, start_us=0)
 CENTRE, SIZE = (BAR.x_px - 0.5, BAR.y_px - 0.5), (4.0, 128.0)
 
 
@@ -46,8 +46,7 @@ def in_order(t, x, y, p):
 
 def test_a_bar_is_found_within_three_steps_and_measured():
     """The events from before it was found are kept."""
-    bar = replace(BAR, start_us=3000)
-    events = ideal_events(LINK, bar)
+    bar, events = lit(2, start_us=3000)
     by_step = followed(events, 20_000)
     assert next(start for start, found in by_step.items() if found) <= 3000 + 3 * STEP_US
     (region,) = by_step[19_000]
@@ -63,8 +62,8 @@ def test_a_bar_is_found_within_three_steps_and_measured():
 @pytest.mark.parametrize(("shake_px", "shake_hz"), [(16, 15), (4, 60)])
 def test_a_shaking_bar_is_followed(shake_px, shake_hz):
     """1.5 px/ms is the most that the paper has seen."""
-    bar = IdealBar(random_symbols(LINK, 3), shake_px=shake_px, shake_hz=shake_hz, start_us=0)
-    by_step = followed(ideal_events(LINK, bar), 100_000)
+    bar, events = lit(3, shake_px=shake_px, shake_hz=shake_hz, start_us=0)
+    by_step = followed(events, 100_000)
     assert {t.id for found in by_step.values() for t in found} == {0}
     (region,) = by_step[99_000]
     at = np.arange(5000.0, 99_000.0, 500.0)
@@ -325,3 +324,61 @@ def test_of_two_regions_that_follow_the_same_the_older_stays():
             regions.shape(first, ShownPlace(first.latest.t_us, CENTRE, SIZE))
             regions.beside(first, first.latest.t_us, (CENTRE[0], CENTRE[1] + 3), SIZE)
     assert regions.alive == [first]
+
+
+IMAGE_PX = 1280, 720
+SWEEP_US = 1500
+
+
+def line(speed, *, along=0.0, slope=0.0, upright=True, rhythmic=True, noise=0.1, many=6000, seed=0):
+    """Events of a line 120 px long through (600, 300) in the middle of a step that begins at 30 ms, px/us."""
+    rng = np.random.default_rng(seed)
+    t = rng.integers(0, SWEEP_US // 100, many) * 100 + rng.integers(20, 60, many)
+    t = t if rhythmic else rng.integers(0, SWEEP_US, many)
+    after, place = t - SWEEP_US / 2, rng.uniform(-60, 60, many)
+    across = speed * after + slope * place + rng.normal(0, 1, many)
+    length = place + along * after
+    x, y = (600 + across, 300 + length) if upright else (600 + length, 300 + across)
+    stray = rng.random(many) < noise
+    x, y = np.where(stray, rng.uniform(500, 700, many), x), np.where(stray, rng.uniform(200, 400, many), y)
+    columns = 30_000 + t, np.rint(x), np.rint(y), rng.integers(0, 2, many)
+    return Events.of(*columns)[np.argsort(t, kind="stable")]
+
+
+BOX = 480, 180, 720, 420
+
+
+@pytest.mark.parametrize("upright", [True, False])
+@pytest.mark.parametrize(("along", "slope"), [(0.0, 0.0), (0.004, 0.0), (0.0, 0.3), (-0.003, -0.2)])
+@pytest.mark.parametrize("speed", [0.0, 0.0025, -0.008])
+def test_place_and_speed_of_a_line(speed, along, slope, upright):
+    events = line(speed, along=along, slope=slope, upright=upright)
+    found = fit_sweep(events, 30_000 + SWEEP_US / 2, BOX, along)
+    x, y, width, height, moves, rows = found
+    assert (x, y) == (pytest.approx(600, abs=1.5), pytest.approx(300, abs=1.5))
+    across, length = (width, height) if upright else (height, width)
+    assert across == pytest.approx(4 + 120 * abs(slope), abs=2.5)
+    # As long as it was drawn, and as far as it moved.
+    assert 116 <= length <= 122 + abs(along) * SWEEP_US / 4
+    want = speed, along
+    assert moves == pytest.approx(want if upright else want[::-1], abs=2e-4)
+    assert found.is_fast == (abs(speed) > 0.002)
+    if upright:
+        lit = np.flatnonzero(rows >= np.median(rows[rows > 0]) / 4)
+        assert lit[[0, -1]].tolist() == pytest.approx([240 - 180, 360 - 180], abs=4)
+
+
+def test_what_lies_on_no_line_is_no_sweep():
+    assert fit_sweep(line(0.005, noise=0.6), 30_750, BOX) is None
+    assert fit_sweep(line(0.005, many=150), 30_750, BOX) is None
+    assert fit_sweep(line(0.005), 30_750, (0, 0, 100, 100)) is None
+
+
+def test_only_what_comes_with_the_chips_is_a_bar():
+    assert with_chips(line(0.005), BOX, 100.0)
+    assert not any(with_chips(line(0.005, rhythmic=False, seed=seed), BOX, 100.0) for seed in range(20))
+    (found,) = find_sweeps(line(0.005), 30_000, SWEEP_US, 100.0, [], IMAGE_PX)
+    assert (found.x_px, found.speed[0]) == (pytest.approx(600, abs=1), pytest.approx(0.005, abs=2e-4))
+    assert find_sweeps(line(0.005, rhythmic=False), 30_000, SWEEP_US, 100.0, [], IMAGE_PX) == []
+    assert find_sweeps(line(0.001), 30_000, SWEEP_US, 100.0, [], IMAGE_PX) == []
+    assert find_sweeps(line(0.005), 30_000, SWEEP_US, 100.0, [(590, 290, 610, 310)], IMAGE_PX) == []

@@ -4,14 +4,14 @@ from collections import Counter
 from dataclasses import replace
 
 import pytest
-from rx_streams import frames_of, noise_events, received, right_frames, said
+from rx_streams import frames_of, lit, noise_events, received, right_frames, said
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.simulated import simulate
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
+from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import changed
 
 
@@ -36,8 +36,7 @@ def at(link, x_px, seconds=0.12, start_us=5000.0):
     """A transmitter at a column for some time, and its events."""
     packets = max(int(seconds * link.packet.chip_rate_hz / link.packet.packet_chips), 1)
     small = {} if link.codebook.clusters == 1 else {"cluster_px": 4.0, "width_px": 2}
-    bar = IdealBar(random_symbols(link, packets, int(x_px)), x_px, start_us=start_us, **small)
-    return bar, ideal_events(link, bar, seed=int(x_px))
+    return lit(packets, int(x_px), link, x_px=x_px, start_us=start_us, **small)
 
 
 def right(packets, link, bar):

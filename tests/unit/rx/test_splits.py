@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from rx_streams import LINK, frames_of, noise_events, received, said
+from rx_streams import LINK, frames_of, lit, noise_events, received, said
 
 from evlcp_sdk.files import shipped
 from evlcp_sdk.io import read_events
@@ -14,7 +14,7 @@ from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import AttitudeLog
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
+from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import Events
 
 FEW_PILOTS = load_link(overrides=["air.pilot_every=4"])
@@ -28,13 +28,13 @@ LAMP = replace(
     ),
     name="lamp",
 )
-OWN = ideal_events(LINK, IdealBar(random_symbols(LINK, 3), ppm=50, shake_px=6, shake_hz=12))
-OTHER = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1), 900.7, 300.2, start_us=19_350))
+_, OWN = lit(3, ppm=50, shake_px=6, shake_hz=12)
+_, OTHER = lit(3, 1, x_px=900.7, y_px=300.2, start_us=19_350)
 BOTH = merged(OWN, OTHER, noise_events(120_000, 200_000))
 
 
 def few_pilots():
-    return ideal_events(FEW_PILOTS, IdealBar(random_symbols(FEW_PILOTS, 3)))
+    return lit(3, link=FEW_PILOTS)[1]
 
 
 def recording():
@@ -43,9 +43,9 @@ def recording():
 
 def growing_together():
     """A bar comes nearer to another by a column a step."""
-    near = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 2), x_px=440, start_us=10_000))
+    _, near = lit(3, 2, x_px=440, start_us=10_000)
     moved = Events.of(near.t_us, near.x - np.minimum(near.t_us // 1500, 40), near.y, near.p)
-    return merged(ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1))), moved)
+    return merged(lit(3, 1)[1], moved)
 
 
 def a_rail():
@@ -55,16 +55,14 @@ def a_rail():
 
 
 def two_links():
-    lamp = IdealBar(random_symbols(LAMP, 6), 800.7, cluster_px=4.0, width_px=2)
-    return merged(ideal_events(BAR, IdealBar(random_symbols(BAR, 2), 300.3)), ideal_events(LAMP, lamp))
+    _, lamp = lit(6, link=LAMP, x_px=800.7, cluster_px=4.0, width_px=2)
+    return merged(lit(2, link=BAR, x_px=300.3)[1], lamp)
 
 
 def crowd():
     """Eight blinking blobs, a bar and noise: more than small limits let in."""
-    blobs = [
-        ideal_events(LINK, IdealBar(random_symbols(LINK, 3, n), 60.0 * n, 120, 0.6, 3, start_us=300 * n))
-        for n in range(1, 9)
-    ]
+    small = {"y_px": 120, "cluster_px": 0.6, "width_px": 3}
+    blobs = (lit(3, n, x_px=60.0 * n, start_us=300 * n, **small)[1] for n in range(1, 9))
     return merged(OWN, *blobs, noise_events(1_700_000, 120_000))
 
 
@@ -139,7 +137,7 @@ def test_a_frame_is_told_with_the_slice_that_ends_it():
 
 def test_frames_from_before_the_first_lock_come_a_few_a_step():
     """Each step gives one frame that ends in it and two older ones, until none is left."""
-    events = ideal_events(LINK, IdealBar(random_symbols(LINK, 2), start_us=-5_000))
+    _, events = lit(2, start_us=-5_000)
     frames, _ = told_by_slices(LINK, events, LINK.regions.step_us)
     a_slice = list(Counter(fed for _, fed in frames).values())
     assert a_slice[:3] == [3, 3, 3]
@@ -149,8 +147,7 @@ def test_frames_from_before_the_first_lock_come_a_few_a_step():
 
 
 def test_of_several_links_a_frame_comes_at_once_where_its_transmitter_holds_its_place():
-    left = ideal_events(BAR, IdealBar(random_symbols(BAR, 7), 300.3))
-    events = merged(left, ideal_events(WH8, IdealBar(random_symbols(WH8, 7), 800.7), seed=1))
+    events = merged(lit(7, link=BAR, x_px=300.3)[1], lit(7, 1, link=WH8, x_px=800.7)[1])
     frames, _ = told_by_slices([BAR, WH8], events, 250)
     assert Counter(frame.link for frame, _ in frames) == {"wh4x2": 70, "wh8": 70}
     late_us = [max(lateness([f for f in frames if f[0].packet == n], events)) for n in range(7)]

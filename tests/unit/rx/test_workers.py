@@ -6,7 +6,7 @@ import signal
 from dataclasses import dataclass, replace
 
 import pytest
-from rx_streams import LINK, frames_of, noise_events, received, said
+from rx_streams import LINK, frames_of, lit, noise_events, received, said
 
 from evlcp_sdk.errors import ConfigError, PluginError, WorkerError
 from evlcp_sdk.link.resolve import load_link
@@ -15,10 +15,10 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx import workers
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.workers import load_kernels
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
+from evlcp_sdk.testing.recordings import merged
 
-OWN = ideal_events(LINK, IdealBar(random_symbols(LINK, 3), ppm=50, shake_px=6, shake_hz=12))
-OTHER = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1), 900.7, 300.2, start_us=19_350))
+_, OWN = lit(3, ppm=50, shake_px=6, shake_hz=12)
+_, OTHER = lit(3, 1, x_px=900.7, y_px=300.2, start_us=19_350)
 EVENTS = merged(OWN, OTHER, noise_events(20_000, 120_000))
 
 
@@ -90,15 +90,8 @@ def test_what_cannot_be():
     local = LINK.with_algorithm("ranging", type("Local", (Broken,), {})(), id="local")
     with pytest.raises(ConfigError, match=r"^workers: an algorithm cannot be sent to another process"):
         Receiver(local, workers=2)
-    lamp = load_link(
-        overrides=[
-            "bar.rows=6",
-            "bar.columns=1",
-            "bar.cluster_rows=6",
-            "bar.cluster_columns=1",
-            "framing.id=uart",
-        ]
-    )
+    one_cluster = "bar.rows=6 bar.columns=1 bar.cluster_rows=6 bar.cluster_columns=1"
+    lamp = load_link(overrides=[*one_cluster.split(), "framing.id=uart"])
     before = multiprocessing.active_children()
     Receiver(lamp, workers=2)
     assert multiprocessing.active_children() == before, "a lamp's characters are not shared"
