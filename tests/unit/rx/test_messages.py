@@ -151,6 +151,9 @@ def test_repetitions_are_added_until_they_decode():
     alone = Feed(combine_packets=0)
     assert not alone(blocks * 5, ber=0.16)
     assert alone.counts == {"blocks_tried": 15, "blocks_failed": 15}
+    noise = [packet_of(noisy(blocks[0], 0.16, feed.rng), number) for number in range(8)]
+    first = next(packet for packet in map(Feed().assembler.add, noise) if packet.block)
+    assert first.block_packets == first.packet + 1 > 1
 
 
 def test_different_blocks_are_not_added():
