@@ -1,13 +1,12 @@
 """Measurements on single pixels and on the readout, for the tests and the figures of `docs/simulator.md`."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.sim import BackgroundSpec, Scene, SensorSpec, Simulation, _kernels
+from evlcp_sdk.sim import BackgroundSpec, Scene, Simulation, _kernels
 from evlcp_sdk.sim.simulation import request_words
 from evlcp_sdk.values import Events
 
@@ -38,15 +37,7 @@ class PixelEvents:
     on: NDArray[np.bool_]
 
 
-def pixel_events(
-    sensor: SensorSpec,
-    edge_us: ArrayLike,
-    light_w_m2: ArrayLike,
-    end_us: float,
-    *,
-    pixels: int = 1,
-    seed: int = 0,
-) -> PixelEvents:
+def pixel_events(sensor, edge_us, light_w_m2, end_us, *, pixels=1, seed=0):
     """Run pixels, at rest in the first light, through light that changes at given times, by more than 0.1 %.
 
     Args:
@@ -91,9 +82,7 @@ def pixel_events(
     return PixelEvents(pixel[order], request[order], code[order] % 2 == 1)
 
 
-def latency_us(
-    sensor: SensorSpec, light_w_m2: float, dark_w_m2: float, *, pixels: int = 400, seed: int = 0
-) -> tuple[float, float]:
+def latency_us(sensor, light_w_m2, dark_w_m2, *, pixels=400, seed=0):
     """Mean latency of the first ON event after a step up, and of the first OFF event after a step down, us.
 
     Before each step the pixels are at rest, and so are their references; no event goes missing.
@@ -108,7 +97,7 @@ def latency_us(
     return means[0], means[1]
 
 
-def latency_with_readout_us(sensor: SensorSpec, light_w_m2: float, side_px: int, *, seed: int = 0) -> float:
+def latency_with_readout_us(sensor, light_w_m2, side_px, *, seed=0):
     """Mean latency of the first ON event, readout included, of a square of pixels that light up at once."""
     sensor = replace(sensor, p_on_miss=0.0)
     one = pixel_events(
@@ -119,22 +108,13 @@ def latency_with_readout_us(sensor: SensorSpec, light_w_m2: float, side_px: int,
     return float(served(words, side_px, sensor.t_row_us)[0].t_us.mean() + 0.5)
 
 
-def words_of(t_us: ArrayLike, row: ArrayLike, column: ArrayLike) -> NDArray[np.int64]:
+def words_of(t_us, row, column):
     """Requests of ON events, as the readout takes them."""
     code = (np.asarray(row) << _kernels.COLUMN_BITS | np.asarray(column)) << 1 | 1
     return request_words(np.asarray(t_us, np.float64), code.astype(np.int32), 0.0)
 
 
-def served(
-    words: NDArray[np.int64],
-    height: int,
-    row_us: float,
-    *,
-    until_us: float = np.inf,
-    limit: tuple[int, int] = (0, 200),
-    memory: Floats | None = None,
-    pending: NDArray[np.bool_] | None = None,
-) -> tuple[Events, int, int, int]:
+def served(words, height, row_us, *, until_us=np.inf, limit=(0, 200), memory=None, pending=None):
     """What the readout makes of sorted requests: events, and `read_out`'s counts of others."""
     n = len(words)
     out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
@@ -146,9 +126,7 @@ def served(
     return Events(*(column[:written] for column in out)), dropped, held, left
 
 
-def crossing_by_steps(
-    sensor: SensorSpec, light: Callable[[float], float], begin_us: float, end_us: float, step_us: float = 0.01
-) -> list[tuple[float, bool]]:
+def crossing_by_steps(sensor, light, begin_us, end_us, step_us=0.01):
     """Threshold crossings (us, ON) of one noiseless pixel, by integrating its log signal in small steps.
 
     dy/dt = (I - exp(y)) / Q by the classical Runge-Kutta method: the brute-force twin of the closed form.
@@ -184,9 +162,7 @@ def crossing_by_steps(
     return found
 
 
-def step_response(
-    sensor: SensorSpec, contrast: ArrayLike, light_w_m2: float = 20.0, *, pixels: int = 4000, seed: int = 0
-) -> Floats:
+def step_response(sensor, contrast, light_w_m2=20.0, *, pixels=4000, seed=0):
     """Share of pixels that send an ON event upon one step of log contrast: the S-curve, float64 (n,)."""
     shares = []
     for delta in np.atleast_1d(np.asarray(contrast, np.float64)):
@@ -197,7 +173,7 @@ def step_response(
     return np.array(shares)
 
 
-def events_per_edge(sensor: SensorSpec, contrast: float, *, rising: bool, steps: int = 400) -> int:
+def events_per_edge(sensor, contrast, *, rising, steps=400):
     """Events of one noiseless pixel while its light changes slowly by a log contrast.
 
     The light climbs a stair of `steps` steps, 1 ms each, at 100 W/m2 and less: the receptor is at rest at the

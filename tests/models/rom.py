@@ -21,18 +21,18 @@ class RomEmulator:
     because of new option bytes.
     """
 
-    def __init__(self, flash: bytes | None = None, protected: bool = False, product: int = 0x413) -> None:
+    def __init__(self, flash=None, protected=False, product=0x413):
         self.flash = bytearray(b"\xff" * FLASH_BYTES if flash is None else flash)
         self.options = bytearray.fromhex("edaa0000000000000fff000000000000")
         self.protected, self.product = protected, product
-        self.erased: list[int] = []
-        self.started: int | None = None
+        self.erased = []
+        self.started = None
         self.resets = 0
         self._out = bytearray()
         self._run = self._sessions()
         next(self._run)
 
-    def receive(self, data: bytes) -> bytes:
+    def receive(self, data):
         """Bytes from the host; gives what is answered."""
         for byte in data:
             if self.started is None:
@@ -40,13 +40,13 @@ class RomEmulator:
         out, self._out = bytes(self._out), bytearray()
         return out
 
-    def _take(self, count: int) -> Taking:
+    def _take(self, count):
         data = bytearray()
         while len(data) < count:
             data.append((yield))
         return bytes(data)
 
-    def _sessions(self) -> Generator[None, int, None]:
+    def _sessions(self):
         while True:
             while (yield from self._take(1))[0] != _SYNC:
                 pass
@@ -62,7 +62,7 @@ class RomEmulator:
                 if good is not None:
                     self._out.append(_ACK if good else _NACK)
 
-    def _command(self, code: int) -> Generator[None, int, bool | None]:
+    def _command(self, code):
         """Whether it was done, to be said; None: said already."""
         if code == 0x00:
             self._out += bytes([len(_COMMANDS), 0x31]) + _COMMANDS
@@ -90,7 +90,7 @@ class RomEmulator:
             return None
         return (yield from self._write(address)) if code == 0x31 else False
 
-    def _write(self, address: int) -> Generator[None, int, bool]:
+    def _write(self, address):
         head = yield from self._take(1)
         body = yield from self._take(head[0] + 2)
         data = body[:-1]
@@ -106,7 +106,7 @@ class RomEmulator:
                 memory[at + n] &= byte
         return True
 
-    def _erase(self) -> Generator[None, int, bool]:
+    def _erase(self):
         head = yield from self._take(2)
         body = yield from self._take(2 * (int.from_bytes(head, "big") + 1) + 1)
         sectors = [int.from_bytes(body[n : n + 2], "big") for n in range(0, len(body) - 1, 2)]
@@ -118,47 +118,47 @@ class RomEmulator:
             self.erased.append(sector)
         return True
 
-    def _memory(self, address: int, count: int) -> tuple[bytearray, int] | None:
+    def _memory(self, address, count):
         for start, memory in ((FLASH_START, self.flash), (_OPTIONS, self.options)):
             if start <= address and address + count <= start + len(memory):
                 return memory, address - start
         return None
 
 
-def _sum(data: bytes) -> int:
+def _sum(data):
     return reduce(xor, data, 0)
 
 
 class RomLine:
     """A line to the emulator, as a `Transport`; a byte takes eleven bits."""
 
-    def __init__(self, rom: RomEmulator, baud: int = 115_200) -> None:
+    def __init__(self, rom, baud=115_200):
         self.name = "rom:"
         self.rom = rom
         self._byte_s = 11 / baud
         self._now = 0.0
         self._out = b""
 
-    def now(self) -> float:
+    def now(self):
         """Time of the line, s."""
         return self._now
 
-    def to_part(self, data: bytes) -> bytes:
+    def to_part(self, data):
         """What of `data` arrives at the part; here everything."""
         return data
 
     to_host = to_part
 
-    def read(self, timeout_s: float) -> bytes:
+    def read(self, timeout_s):
         """Bytes of the part; or time passes."""
         out, self._out = self._out, b""
         self._now += self._byte_s * len(out) if out else max(timeout_s, 1e-4)
         return out
 
-    def write(self, data: bytes) -> None:
+    def write(self, data):
         """Bytes to the part."""
         self._now += self._byte_s * len(data)
         self._out += self.to_host(self.rom.receive(self.to_part(data)))
 
-    def close(self) -> None:
+    def close(self):
         """Nothing to let go."""

@@ -10,25 +10,18 @@ import contextlib
 import importlib.util
 import struct
 import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
 
-from firmware_host.emulators.listening import HostLine
 from firmware_host.errors import ToolchainError
 from firmware_host.images import FLASH_START, FlashImage
 from firmware_host.protocol.generated.requests import CHIP_DARK, LEDS
 from tests.models.rom import RomEmulator
-
-if TYPE_CHECKING:
-    from tests.models.stm32 import Shown, Stm32
 
 _TICK_HZ = 14_000_000
 _STEP_US = 200
 _BOOT_US = 15_000
 
 
-def records(log: "list[Shown]", chip: int, units_a_tick: int) -> tuple[bytes, int]:
+def records(log, chip, units_a_tick):
     """LED records of what was shown, chips numbered from where the outputs go on; and the next number."""
     out = []
     for shown in log:
@@ -43,7 +36,7 @@ def records(log: "list[Shown]", chip: int, units_a_tick: int) -> tuple[bytes, in
     return b"".join(out), chip
 
 
-def serve(chip: "Stm32", line: HostLine, leds: BinaryIO | None, stopped: Callable[[], bool]) -> None:
+def serve(chip, line, leds, stopped):
     """Run a model for hosts, one at a time, until it is stopped."""
     from tests.models.stm32 import UNIT_HZ
 
@@ -65,7 +58,7 @@ def serve(chip: "Stm32", line: HostLine, leds: BinaryIO | None, stopped: Callabl
                 leds.flush()
 
 
-def serve_rom(rom: RomEmulator, line: HostLine, flash: Path | None, stopped: Callable[[], bool]) -> None:
+def serve_rom(rom, line, flash, stopped):
     """Let hosts talk to a ROM, one after the other, until one has it run something, or it is stopped.
 
     Args:
@@ -86,7 +79,7 @@ def serve_rom(rom: RomEmulator, line: HostLine, flash: Path | None, stopped: Cal
         flash.write_bytes(rom.flash)
 
 
-def flashed(flash: bytes) -> "Stm32":
+def flashed(flash):
     """The model of a part with this flash, by a crystal of 8 MHz or else of 12."""
     from tests.models.stm32 import Stm32
 
@@ -98,9 +91,7 @@ def flashed(flash: bytes) -> "Stm32":
     raise ToolchainError("what was flashed does not run on the model")
 
 
-def serve_part(
-    line: HostLine, image: Path | None, flash: Path | None, leds: Path | None, stopped: Callable[[], bool]
-) -> None:
+def serve_part(line, image, flash, leds, stopped):
     """Be a part until it is stopped."""
     with contextlib.ExitStack() as stack:
         record = None if leds is None else stack.enter_context(leds.open("wb"))

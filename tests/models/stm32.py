@@ -12,24 +12,20 @@ import copy
 import heapq
 import secrets
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import unicorn
-from numpy.typing import NDArray
 from unicorn import arm_const
 
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.images import FlashImage
 from firmware_host.protocol.client import Timing
-
-engine: Any = unicorn  # it has no types
 
 UNIT_HZ = 336_000_000
 HSI_HZ, HSE_HZ, LSI_HZ = 16_000_000, 8_000_000, 32_000
@@ -50,19 +46,19 @@ SLICE = 240
 class Peripheral:
     """Registers that are attributes, by their offsets, and events that end when it is set up anew."""
 
-    REGISTERS: ClassVar[dict[int, str]] = {}
+    REGISTERS: ClassVar = {}
     generation = 0
 
-    def __init__(self, chip: "Stm32") -> None:
+    def __init__(self, chip):
         self.chip = chip
 
-    def read(self, offset: int) -> int:
-        return int(getattr(self, self.REGISTERS[offset]))
+    def read(self, offset):
+        return getattr(self, self.REGISTERS[offset])
 
-    def write(self, offset: int, value: int) -> None:
+    def write(self, offset, value):
         setattr(self, self.REGISTERS[offset], value)
 
-    def later(self, time: int, event: Callable[[], None]) -> None:
+    def later(self, time, event):
         """Do this then, in this generation."""
         generation = self.generation
         self.chip.at(time, lambda: event() if generation == self.generation else None)
@@ -75,7 +71,7 @@ class Timer(Peripheral):
         *(0x00, 0x04, 0x08, 0x0C, 0x10, 0x14, 0x18, 0x20, 0x24, 0x28, 0x2C, 0x34),
     )
 
-    def __init__(self, chip: "Stm32", name: str) -> None:
+    def __init__(self, chip, name):
         super().__init__(chip)
         self.name = name
         self.r = dict.fromkeys((0x00, 0x04, 0x08, 0x0C, 0x10, 0x18, 0x20, 0x24, 0x28, 0x34), 0)
@@ -85,42 +81,42 @@ class Timer(Peripheral):
         self.unit = UNIT_HZ // HSI_HZ  # time of a count
         self.stands = False  # broken: the counter does not move
         self.request = False  # of the update, for DMA
-        self.on_edge: Callable[[bool], None] = lambda _: None
-        self.slave: Timer | None = None
-        self.master: Timer | None = None
+        self.on_edge = lambda _: None
+        self.slave = None
+        self.master = None
 
     @property
-    def gated(self) -> bool:
+    def gated(self):
         """It counts while its master does."""
         return self.r[self.SMCR] & 0x77 == 0x05
 
     @property
-    def running(self) -> bool:
+    def running(self):
         """Whether the counter moves."""
         gate = self.master is None or not self.gated or self.master.running
         return bool(self.r[self.CR1] & 1) and gate and not self.stands
 
-    def counter(self) -> int:
+    def counter(self):
         period = self.r[self.ARR] + 1
         moved = (self.chip.now - self.since) // self.unit if self.running else 0
         return (self.held + moved) % period
 
-    def hold(self, value: int) -> None:
+    def hold(self, value):
         """Let the counter go on from a value."""
         self.held, self.since = value, self.chip.now
 
-    def read(self, offset: int) -> int:
+    def read(self, offset):
         if offset == self.CCR1 and self.r[self.CCMR1] & 3 == 1:
             self.r[self.SR] &= ~2  # a capture that is read
         return self.counter() if offset == self.CNT else self.r[offset]
 
-    def capture(self) -> None:
+    def capture(self):
         """A rising edge at channel 1."""
         if self.r[self.CCMR1] & 0xFF == 1 and self.r[self.CCER] & 0xF == 1 and self.running:
             self.r[self.CCR1] = self.counter()
             self.r[self.SR] |= 2
 
-    def write(self, offset: int, value: int) -> None:
+    def write(self, offset, value):
         self.hold(self.counter())
         if offset == self.EGR:
             assert value == 1, value
@@ -148,26 +144,26 @@ class Timer(Peripheral):
                 self.slave.trigger()
         self.plan()
 
-    def trigger(self) -> None:
+    def trigger(self):
         """A rising edge of ITR0: TIM3's is TIM1's TRGO (RM0090, table 99)."""
         if self.r[self.SMCR] & 0x77 == 0x06:
             self.hold(self.counter())
             self.r[self.CR1] |= 1
             self.plan()
 
-    def update(self) -> None:
+    def update(self):
         """An update event: a flag, and with UDE a DMA request that stays until it is served."""
         self.r[self.SR] |= 1
         if self.r[self.DIER] & 0x100:
             self.request = True
             self.chip.at(self.chip.now, self.chip.dma.serve)
 
-    def output(self) -> bool:
+    def output(self):
         """Channel 1 in PWM mode 1."""
         on = self.r[self.CCMR1] & 0x70 == 0x60 and self.r[self.CCER] & 1
         return bool(on) and self.counter() < self.r[self.CCR1]
 
-    def plan(self) -> None:
+    def plan(self):
         """Look ahead to the next wrap and the next edge of the output."""
         self.generation += 1
         self.on_edge(self.output())
@@ -180,7 +176,7 @@ class Timer(Peripheral):
         if here < edge < period:
             self.later(base + (edge - here) * unit, lambda: self.event(False))
 
-    def event(self, wraps: bool) -> None:
+    def event(self, wraps):
         if not self.running:
             return
         if wraps:
@@ -188,7 +184,7 @@ class Timer(Peripheral):
             self.update()
         self.plan()
 
-    def stop_for_good(self) -> None:
+    def stop_for_good(self):
         """Broken: the counter stands, whatever is written."""
         self.hold(self.counter())
         self.stands = True
@@ -208,7 +204,7 @@ class Dma(Peripheral):
     ahead = 0  # the word fetched ahead
     dead = False
 
-    def write(self, offset: int, value: int) -> None:
+    def write(self, offset, value):
         on = self.cr & 1
         if offset == 0x0C:
             self.flags &= ~value
@@ -225,7 +221,7 @@ class Dma(Peripheral):
             super().write(offset, value)
         self.line()
 
-    def start(self) -> None:
+    def start(self):
         # channel 6, 16 bits both sides, memory counts up, circular, to the peripheral: all the model knows
         assert self.cr & ~0x1E == 6 << 25 | 3 << 16 | 1 << 13 | 1 << 11 | 1 << 10 | 1 << 8 | 1 << 6 | 1
         assert not self.fcr & 4  # direct mode
@@ -234,11 +230,11 @@ class Dma(Peripheral):
         self.fetch()
         self.serve()
 
-    def fetch(self) -> None:
+    def fetch(self):
         at = self.memory + 2 * (self.count - self.left)
         self.ahead = struct.unpack("<H", self.chip.uc.mem_read(at, 2))[0]
 
-    def serve(self) -> None:
+    def serve(self):
         """A request of TIM1's update, if the stream runs, moves a word at once."""
         if not self.chip.tim1.request or not self.cr & 1 or self.dead:
             return
@@ -254,14 +250,14 @@ class Dma(Peripheral):
         self.fetch()
         self.line()
 
-    def error(self, flag: int) -> None:
+    def error(self, flag):
         """An error of the stream; a transfer error ends it."""
         self.flags |= flag
         if flag == self.TRANSFER_ERROR:
             self.cr &= ~1
         self.line()
 
-    def line(self) -> None:
+    def line(self):
         """Raise or drop the interrupt."""
         cr = self.cr
         enabled = (cr >> 4 & 1) * self.ALL | (cr >> 3 & 1) * self.HALF | (cr >> 2 & 1) * self.TRANSFER_ERROR
@@ -274,38 +270,37 @@ class Spi(Peripheral):
 
     REGISTERS: ClassVar = {0x00: "cr1", 0x04: "cr2", 0x08: "status", 0x0C: "received"}
     cr1 = cr2 = received = began = 0
-    buffer: int | None = None
-    word: int | None = None
+    buffer = word = None
     chain = 0  # 96 bits; the one that left first is the highest
     dead = False
 
     @property
-    def status(self) -> int:
+    def status(self):
         return (self.buffer is None) << 1 | (self.word is not None) << 7
 
-    def bits_done(self) -> int:
+    def bits_done(self):
         """Bits of the word under way that have left."""
         if self.word is None or self.dead:
             return 0
         return min(16, (self.chip.now - self.began) // self.bit)
 
     @property
-    def bit(self) -> int:
+    def bit(self):
         return UNIT_HZ // self.chip.pclk2 * (2 << (self.cr1 >> 3 & 7))
 
-    def outputs(self) -> int:
+    def outputs(self):
         """The chain as it stands, a word on its way included."""
         done = self.bits_done()
         return (self.chain << done | (self.word or 0) >> (16 - done)) & (1 << LEDS) - 1
 
-    def write(self, offset: int, value: int) -> None:
+    def write(self, offset, value):
         if offset == 0x0C:
             self.send(value)
         else:
             assert offset or value & ~0x78 == 1 << 11 | 1 << 9 | 1 << 8 | 1 << 2, hex(value)
             super().write(offset, value)
 
-    def send(self, word: int) -> None:
+    def send(self, word):
         if not self.cr1 & 0x40:
             return
         if self.word is None and not self.dead:
@@ -313,12 +308,12 @@ class Spi(Peripheral):
         else:
             self.buffer = word
 
-    def shift(self, word: int) -> None:
+    def shift(self, word):
         """A word begins to leave."""
         self.word, self.began = word, self.chip.now
         self.chip.at(self.chip.now + 16 * self.bit, self.done)
 
-    def done(self) -> None:
+    def done(self):
         """A word has left."""
         if self.dead or self.word is None:
             return
@@ -345,22 +340,22 @@ class Shown:
 class Drivers:
     """The latches and output enable of the LED drivers; the latch is transparent while it is high."""
 
-    def __init__(self, chip: "Stm32") -> None:
+    def __init__(self, chip):
         self.chip = chip
         self.latch = False
         self.held = 0
-        self.log: list[Shown] = []
+        self.log = []
 
     @property
-    def dark(self) -> bool:
+    def dark(self):
         """Output enable is high: driven so, or an input, which the board pulls up."""
         return self.chip.pin(0x40020400, 0) is not False
 
     @property
-    def row(self) -> int:
+    def row(self):
         return 0 if self.dark else self.held
 
-    def look(self) -> None:
+    def look(self):
         """Something may have changed: the chain, the latch, output enable."""
         level = self.chip.pin(0x40020000, 6)
         closes = self.latch and not level
@@ -384,22 +379,22 @@ class Usart(Peripheral):
     free_at = 0  # when the transmitter has room
     line_free = 0
 
-    def __init__(self, chip: "Stm32") -> None:
+    def __init__(self, chip):
         super().__init__(chip)
         self.to_host = bytearray()
 
-    def right_rate(self) -> bool:
+    def right_rate(self):
         """Within 3 % of the host's."""
         return self.brr >= 16 and abs(self.chip.pclk2 / self.brr / 1e6 - 1) < 0.03
 
-    def arrive(self, data: bytes) -> None:
+    def arrive(self, data):
         """Bytes from the host, one after the other."""
         self.line_free = max(self.line_free, self.chip.now)
         for byte in data:
             self.line_free += self.BYTE
             self.chip.at(self.line_free, partial(self.received, byte))
 
-    def received(self, byte: int) -> None:
+    def received(self, byte):
         """A byte of the host has come."""
         if self.cr1 & 0x2004 != 0x2004 or not self.right_rate():
             return
@@ -409,7 +404,7 @@ class Usart(Peripheral):
             self.dr, self.sr = byte, self.sr | 0x20
         self.line()
 
-    def read(self, offset: int) -> int:
+    def read(self, offset):
         if offset == 0x00:
             return self.sr & ~0x80 | (self.chip.now >= self.free_at) << 7
         if offset == 0x04:
@@ -417,7 +412,7 @@ class Usart(Peripheral):
             self.line()
         return super().read(offset)
 
-    def write(self, offset: int, value: int) -> None:
+    def write(self, offset, value):
         if offset == 0x04:
             if self.cr1 & 0x2008 == 0x2008:
                 leaves = max(self.chip.now, self.free_at) + self.BYTE
@@ -429,7 +424,7 @@ class Usart(Peripheral):
             super().write(offset, value)
         self.line()
 
-    def line(self) -> None:
+    def line(self):
         """Raise or drop the interrupt."""
         self.chip.set_line(16 + self.IRQ, bool(self.cr1 & 0x20 and self.sr & 0x28))
 
@@ -440,19 +435,19 @@ class SysTick(Peripheral):
     REGISTERS: ClassVar = {0x10: "csr", 0x14: "rvr", 0x18: "cvr"}
     csr = rvr = cvr = 0
 
-    def write(self, offset: int, value: int) -> None:
+    def write(self, offset, value):
         assert offset != 0x10 or value in (0, 5, 7), "on the core's clock"
         if offset != 0x18:
             super().write(offset, value & 0xFFFFFF)
         self.plan()  # a write to the counter clears it: it begins again with the reload value
 
-    def plan(self) -> None:
+    def plan(self):
         """Look ahead to the end."""
         self.generation += 1
         if self.csr & 1 and self.rvr:
             self.later(self.chip.now + (self.rvr + 1) * self.chip.cycle, self.ends)
 
-    def ends(self) -> None:
+    def ends(self):
         if self.csr & 2:
             self.chip.pending.add(15)
         self.plan()
@@ -468,15 +463,15 @@ class Iwdg(Peripheral):
     looks_at = 1 << 62
 
     @property
-    def busy(self) -> int:
+    def busy(self):
         return 3 if self.chip.now < self.busy_until else 0
 
     @property
-    def timeout(self) -> int:
+    def timeout(self):
         """How long it waits."""
         return (self.rlr + 1) * (4 << self.pr) * UNIT_HZ // LSI_HZ
 
-    def write(self, offset: int, value: int) -> None:
+    def write(self, offset, value):
         if offset == 0x0:
             self.open = value == 0x5555
             self.on |= value == 0xCCCC
@@ -486,18 +481,18 @@ class Iwdg(Peripheral):
             self.busy_until = self.chip.now + 5 * UNIT_HZ // LSI_HZ
             super().write(offset, value)
 
-    def feed(self) -> None:
+    def feed(self):
         """Begin anew."""
         self.due = self.chip.now + self.timeout
         if self.due < self.looks_at:
             self._look_at(self.due)
 
-    def _look_at(self, time: int) -> None:
+    def _look_at(self, time):
         """Look then whether it bites: it is fed much more often than it could."""
         self.looks_at = time
         self.later(time, lambda: self._look(time))
 
-    def _look(self, time: int) -> None:
+    def _look(self, time):
         if self.looks_at != time:
             return
         if self.chip.now >= self.due:
@@ -515,7 +510,7 @@ class Flash(Peripheral):
     keys = (0, 0)
     stale = False  # the caches may hold what was erased
 
-    def write(self, offset: int, value: int) -> None:
+    def write(self, offset, value):
         if offset == 0x00:
             # a cache is reset only while it is off
             assert not (value & 0x1800 and value & 0x600), hex(value)
@@ -544,7 +539,7 @@ class Rng(Peripheral):
 
     control = ready = 0
 
-    def read(self, offset: int) -> int:
+    def read(self, offset):
         clocked = self.chip.plain.get(0x40023834, 0) >> 6 & 1 and self.chip.plain[0x40023800] >> 25 & 1
         on = clocked and self.control >> 2 & 1
         if offset == 0x4:
@@ -554,13 +549,13 @@ class Rng(Peripheral):
             return int.from_bytes(secrets.token_bytes(4), "little")
         return self.control if offset == 0x0 else 0
 
-    def write(self, offset: int, value: int) -> None:
+    def write(self, offset, value):
         if offset == 0x0:
             self.control = value
             self.ready = self.chip.now + self.WORD
 
 
-def numbers(offset: int, value: int) -> set[int]:
+def numbers(offset, value):
     """The exceptions that the bits of a register of the NVIC are."""
     return {16 + 8 * offset + n for n in range(32) if value >> n & 1}
 
@@ -577,9 +572,9 @@ class Stm32:
         hse_hz: The crystal.
     """
 
-    def __init__(self, image: Path | FlashImage, hse_hz: int = HSE_HZ) -> None:
+    def __init__(self, image, hse_hz=HSE_HZ):
         self.hse_hz = hse_hz
-        uc: Any = engine.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
+        uc = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
         self.uc = uc
         uc.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
         uc.mem_map(0x08000000, 1 << 20)
@@ -593,29 +588,29 @@ class Stm32:
         uc.mem_write(whole.address, whole.data)
         uc.hook_add(unicorn.UC_HOOK_MEM_READ, self._slot_read, begin=0x080C0000, end=0x080FFFFF)
         self.now = 0
-        self.events: list[tuple[int, int, Callable[[], None]]] = []
+        self.events = []
         self.order = count()
-        self.resets: list[int] = []
+        self.resets = []
         self.hse_works = True
         self.reset(RESET_BY_PIN)
 
     # -- clocks and reset
 
-    def reset(self, cause: int) -> None:
+    def reset(self, cause):
         """All but RAM, flash and the log of the LEDs begins anew."""
         before = vars(self).get("drivers"), vars(self).get("spi")
         self.resets.append(cause)
         self.events.clear()
-        self.plain: dict[int, int] = {0x40023800: 0x83, 0x40023874: cause, 0x40023804: 0x24003010}
+        self.plain = {0x40023800: 0x83, 0x40023874: cause, 0x40023804: 0x24003010}
         self.plain[0x40020000] = 0xA8000000
         self.cycle = UNIT_HZ // HSI_HZ
-        self.enabled: set[int] = set()
-        self.pending: set[int] = set()
-        self.lines: set[int] = set()
-        self.priorities: dict[int, int] = {}
-        self.active: list[int] = []
-        self.entered: list[tuple[int, int]] = []
-        self.longest: dict[int, int] = {}
+        self.enabled = set()
+        self.pending = set()
+        self.lines = set()
+        self.priorities = {}
+        self.active = []
+        self.entered = []
+        self.longest = {}
         self.tim1, self.tim2, self.tim3 = Timer(self, "TIM1"), Timer(self, "TIM2"), Timer(self, "TIM3")
         self.tim1.slave, self.tim3.master = self.tim3, self.tim1
         self.tim3.on_edge = lambda _: self.drivers.look()
@@ -625,7 +620,7 @@ class Stm32:
         if before[0]:
             self.drivers.log, self.drivers.held = before[0].log, before[0].held
             self.spi.chain = before[1].chain
-        self.places: dict[int, Any] = {
+        self.places = {
             0x40000000: self.tim2,
             0x40000400: self.tim3,
             0x40003000: self.iwdg,
@@ -641,10 +636,10 @@ class Stm32:
         self.pc = entry & ~1
         self.drivers.look()
 
-    def snapshot(self) -> Callable[[], None]:
+    def snapshot(self):
         """What sets the part, its memories and the log of its LEDs back to now, as often as it is called."""
 
-        def copied(state: dict[str, Any]) -> dict[str, Any]:
+        def copied(state):
             kinds = (dict, list, set, bytearray)
             return {k: copy.copy(v) if isinstance(v, kinds) else v for k, v in state.items()}
 
@@ -655,7 +650,7 @@ class Stm32:
         pieces = [(0x20000000, 1 << 17), *((0x08000000 + (n << 17), 1 << 17) for n in range(8))]
         memories = [(at, bytes(self.uc.mem_read(at, size))) for at, size in pieces]
 
-        def back() -> None:
+        def back():
             for thing, state in zip(things, states, strict=True):
                 vars(thing).clear()
                 vars(thing).update(copied(state))
@@ -668,24 +663,24 @@ class Stm32:
         return back
 
     @property
-    def stack(self) -> int:
+    def stack(self):
         return int(self.uc.reg_read(arm_const.UC_ARM_REG_SP))
 
-    def bus_shift(self, place: int) -> int:
+    def bus_shift(self, place):
         """By how many bits the clock of APB1 (10) or APB2 (13) is divided."""
         divider = self.plain.get(0x40023808, 0) >> place & 7
         return divider - 3 if divider & 4 else 0
 
     @property
-    def pclk2(self) -> int:
+    def pclk2(self):
         """Clock of APB2, Hz."""
         return UNIT_HZ // self.cycle >> self.bus_shift(13)
 
-    def timer_unit(self, name: str) -> int:
+    def timer_unit(self, name):
         """Time of a count: timers get twice the bus clock if that is divided (RM0090 7.2)."""
         return self.cycle << max(0, self.bus_shift(13 if name == "TIM1" else 10) - 1)
 
-    def _rcc_write(self, offset: int, value: int) -> None:
+    def _rcc_write(self, offset, value):
         at = 0x40023800 + offset
         if offset == 0x00:
             hse = bool(value & 1 << 16 and self.hse_works)
@@ -707,7 +702,7 @@ class Stm32:
             value = self.plain[at] & (0 if value & 1 << 24 else 0xFFFFFFFF)
         self.plain[at] = value
 
-    def _core_cycle(self, cycle: int, cfgr: int) -> None:
+    def _core_cycle(self, cycle, cfgr):
         timers = (self.tim1, self.tim2, self.tim3)
         for timer in timers:
             timer.hold(timer.counter())
@@ -718,15 +713,15 @@ class Stm32:
             timer.plan()
         self.systick.plan()
 
-    def pulse_at(self, time: float) -> None:
+    def pulse_at(self, time):
         """A rising edge on PA0 then, in units of the board's own crystal."""
         self.at(round(time), self._pulse)
 
-    def _pulse(self) -> None:
+    def _pulse(self):
         if self.plain.get(0x40020000, 0) & 3 == 2 and self.plain.get(0x40020020, 0) & 15 == 1:  # TIM2
             self.tim2.capture()
 
-    def stop_crystal(self) -> None:
+    def stop_crystal(self):
         """The crystal stands: with clock security the core goes on at 16 MHz, with an NMI, else it stops."""
         self.hse_works = False
         cr = self.plain[0x40023800]
@@ -751,7 +746,7 @@ class Stm32:
 
     # -- pins
 
-    def pin(self, port: int, number: int) -> bool | None:
+    def pin(self, port, number):
         """What a pin drives; None if it does not."""
         mode = self.plain.get(port, 0) >> 2 * number & 3
         if mode == 1:
@@ -763,10 +758,10 @@ class Stm32:
 
     # -- registers
 
-    def _slot_read(self, uc: object, access: int, at: int, size: int, value: int, data: object) -> None:
+    def _slot_read(self, uc, access, at, size, value, data):
         assert not self.flash.stale, f"{at:#x} is read through caches that were not flushed"
 
-    def _read(self, uc: object, offset: int, size: int, base: int) -> int:
+    def _read(self, uc, offset, size, base):
         at = base + offset
         if at == 0x40000024:  # by far the most frequent one
             return self.tim2.counter()
@@ -782,7 +777,7 @@ class Stm32:
             return int(self.thermal_open and pulled_up) << 1
         return self.plain.get(at, 0)
 
-    def _write(self, uc: object, offset: int, size: int, value: int, base: int) -> None:
+    def _write(self, uc, offset, size, value, base):
         at = base + offset
         place = self.places.get(at & ~0x3FF)
         if place is not None:
@@ -816,17 +811,17 @@ class Stm32:
 
     # -- exceptions
 
-    def set_line(self, number: int, high: bool) -> None:
+    def set_line(self, number, high):
         if high:
             self.lines.add(number)
             self.pending.add(number)
         else:
             self.lines.discard(number)
 
-    def _priority(self, number: int) -> int:
+    def _priority(self, number):
         return {2: -2, 3: -1}.get(number, self.priorities.get(number, 0))
 
-    def _take(self) -> None:
+    def _take(self):
         ready = [n for n in self.pending if n < 16 or n in self.enabled]
         if not ready:
             return
@@ -837,7 +832,7 @@ class Stm32:
         self.exception(number)
         self.entered.append((number, self.now))
 
-    def exception(self, number: int) -> None:
+    def exception(self, number):
         """Enter an exception: eight words go onto the stack."""
         c, uc = arm_const, self.uc
         frame = [*map(uc.reg_read, KEPT), self.pc, uc.reg_read(c.UC_ARM_REG_XPSR) | 1 << 24]
@@ -855,7 +850,7 @@ class Stm32:
         self.active.append(number)
         self.now += 12 * self.cycle
 
-    def _leave(self) -> None:
+    def _leave(self):
         c, uc = arm_const, self.uc
         stack = uc.reg_read(c.UC_ARM_REG_SP)
         *kept, self.pc, status = struct.unpack("<8I", uc.mem_read(stack, 32))
@@ -873,18 +868,18 @@ class Stm32:
 
     # -- time
 
-    def at(self, time: int, event: Callable[[], None]) -> None:
+    def at(self, time, event):
         """Do this then."""
         heapq.heappush(self.events, (time, next(self.order), event))
 
-    def _events(self) -> None:
+    def _events(self):
         while self.events and self.events[0][0] <= self.now:
             time, _, event = heapq.heappop(self.events)
             now, self.now = self.now, time
             event()
             self.now = max(now, self.now)
 
-    def run(self, us: float) -> None:
+    def run(self, us):
         """Let `us` microseconds pass."""
         end = self.now + round(us * US)
         while self.now < end:
@@ -913,14 +908,14 @@ class Stm32:
 class ModelLine:
     """The host's line to the model, as a `Transport`; its clock is the model's."""
 
-    def __init__(self, chip: Stm32) -> None:
+    def __init__(self, chip):
         self.name = "model:"
         self.chip = chip
 
-    def now(self) -> float:
+    def now(self):
         return self.chip.now / UNIT_HZ
 
-    def read(self, timeout_s: float) -> bytes:
+    def read(self, timeout_s):
         """Bytes from the board; time passes until some come, or `timeout_s` is over."""
         end = self.chip.now + max(50 * US, int(timeout_s * UNIT_HZ))
         while not self.chip.usart.to_host and self.chip.now < end:
@@ -929,19 +924,19 @@ class ModelLine:
         self.chip.usart.to_host.clear()
         return data
 
-    def write(self, data: bytes) -> None:
+    def write(self, data):
         self.chip.usart.arrive(data)
 
-    def close(self) -> None:
+    def close(self):
         """Nothing to let go."""
 
 
-def connect(chip: Stm32) -> Board:
+def connect(chip):
     """A session with the firmware on a model."""
     return Board(Session(ModelLine(chip), Timing(latency_s=0.02)))
 
 
-def lit_rows(log: list[Shown]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+def lit_rows(log):
     """Rows that the latch showed, from the first lit one on, (n, 96), and when."""
     shown = [s for s in log if s.latched and not s.dark]
     while shown and not shown[0].row:

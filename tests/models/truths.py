@@ -1,15 +1,13 @@
 """Truths of another generator, with the keys of ours: scenes that our simulator renders in their place."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
 
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.sim import Scene, SentBar, resolve_scene, truth_from_table
+from evlcp_sdk.sim import resolve_scene, truth_from_table
 from evlcp_sdk.sim.record import OF_SENSOR
 
 
-def scene_of_truth(truth: Mapping[str, Any]) -> Scene:
+def scene_of_truth(truth):
     """The scene of a recording, from its truth: the same bars, symbols, light and sensor; another vibration.
 
     Everything is taken over that both know: covers, wiper, bloom, potholes, mirror images, ghost images and
@@ -55,12 +53,12 @@ def scene_of_truth(truth: Mapping[str, Any]) -> Scene:
     return resolve_scene(table, source="truth")
 
 
-def _taken(given: Mapping[str, Any], keys: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Any]:
+def _taken(given, keys, optional=()):
     """Values under keys that a scene has, too; the optional ones where they are."""
     return {key: given[key] for key in (*keys, *(key for key in optional if key in given))}
 
 
-def _bar_spec_of(bar: Mapping[str, Any], sent: SentBar, given: Mapping[str, Any]) -> dict[str, Any]:
+def _bar_spec_of(bar, sent, given):
     """A bar's table of a scene, from its row of the truth and what that means."""
     found = _taken(
         bar,
@@ -75,7 +73,7 @@ def _bar_spec_of(bar: Mapping[str, Any], sent: SentBar, given: Mapping[str, Any]
     return found
 
 
-def _motion_of(given: Mapping[str, Any], focal_px: float) -> dict[str, Any]:
+def _motion_of(given, focal_px):
     """What a scene's table says of the camera's motion, as keys of `[motion]`."""
     found = _taken(given, ("distance_m", "speed_mps", "vib_rate_rad_s"), ("lateral_mps",))
     names = {
@@ -96,7 +94,7 @@ def _motion_of(given: Mapping[str, Any], focal_px: float) -> dict[str, Any]:
     return found
 
 
-def _others_of(truth: Mapping[str, Any], m_per_px: float) -> dict[str, Any]:
+def _others_of(truth, m_per_px):
     """What another generator's truth says of mirror images, ghost images and panels."""
     camera = truth["camera"]
     reflections, lamps = [], []

@@ -2,7 +2,7 @@
 
 from collections import deque
 
-from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.emulators.simulated import SimulatedLine
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
 
@@ -12,24 +12,17 @@ class UsbLine(SimulatedLine):
     What the host sends USB keeps for `frame_s`, a full-speed frame.
     """
 
-    def __init__(
-        self,
-        board: SimulatedBoard,
-        latency_s: float,
-        baud: int = DEFAULT_BAUD,
-        frame_s: float = 0.0,
-        name: str = "simulated USB:",
-    ) -> None:
+    def __init__(self, board, latency_s, baud=DEFAULT_BAUD, frame_s=0.0, name="simulated USB:"):
         super().__init__(board, name, step_us=20)
         self._byte_us = 10e6 / baud
         self._latency_us = latency_s * 1e6
         self._frame_us = frame_s * 1e6
-        self._out: deque[tuple[float, bytes]] = deque()
-        self._in: deque[tuple[float, bytes]] = deque()
+        self._out = deque()
+        self._in = deque()
         self._out_free_us = 0.0
         self._in_free_us = 0.0
 
-    def write(self, data: bytes) -> None:
+    def write(self, data):
         """Bytes to the board, one after the other at the line's rate."""
         at = max(self.board.now_us + self._frame_us, self._out_free_us)
         for byte in data:
@@ -37,7 +30,7 @@ class UsbLine(SimulatedLine):
             self._out.append((at, bytes([byte])))
         self._out_free_us = at
 
-    def read(self, timeout_s: float) -> bytes:
+    def read(self, timeout_s):
         """Bytes from the board, once they have come over the line and the bridge lets go of them."""
         end = self.board.now_us + max(self.step_us, int(timeout_s * 1e6))
         while True:
