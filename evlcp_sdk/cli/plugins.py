@@ -43,12 +43,9 @@ def table_of(registry: Registry) -> dict[str, list[dict[str, Any]]]:
         "roles": [{"role": r.name, "verb": r.verb, "default": r.default} for r in ROLES.values()],
         "algorithms": [
             {
-                "role": e.algorithm.role,
-                "id": e.algorithm.id,
+                **{key: getattr(e.algorithm, key) for key in ("role", "id", "revision", "summary")},
                 "distribution": e.distribution,
                 "version": e.version,
-                "revision": e.algorithm.revision,
-                "summary": e.algorithm.summary,
                 "default": ROLES[e.algorithm.role].default == e.algorithm.id,
                 "conflict": count[e.algorithm.role, e.algorithm.id] > 1,
             }

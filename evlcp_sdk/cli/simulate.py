@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, console, echo, print_json, progress_bar
+from evlcp_sdk.cli._common import Json, Overrides, console, echo, print_json, progress_bar
 from evlcp_sdk.spelling import counted
 
 
@@ -28,10 +28,7 @@ def simulate(
     seed: Annotated[
         int | None, typer.Option("--seed", min=0, help="Seed of everything random, instead of the scene's.")
     ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="TABLE.KEY=VALUE", help="Override one value; may be repeated."),
-    ] = None,
+    overrides: Overrides = None,
     threads: Annotated[
         int, typer.Option("--threads", min=1, max=256, help="Threads; the recording is the same.")
     ] = 1,
