@@ -29,33 +29,31 @@ def at(polynomial, x):
     return value
 
 
-def words_of(sent, words, data):
-    return [np.concatenate([sent[w:data:words], sent[data + w :: words]]) for w in range(words)]
+def coded(length=960, seed=0, **parameters):
+    """A code, a message, its coded bits, and where the bytes of each codeword are, data and parity."""
+    code = ReedSolomon(**parameters).compile(length)
+    message = np.random.default_rng(seed).integers(0, 2, code.message_bits).astype(np.uint8)
+    words, data = -(-(length // 8) // 255), code.message_bits // 8 + 3
+    parity = (length // 8 - data) // words
+    places = [(np.arange(w, data, words), data + w + words * np.arange(parity)) for w in range(words)]
+    return code, message, code.encode(message), places
 
 
-def message_of(bits, seed=0):
-    return np.random.default_rng(seed).integers(0, 2, bits).astype(np.uint8)
-
-
-def llr_of(coded):
-    return (8 * (1 - 2 * coded.astype(np.float32))).astype(np.float32)
+def llr_of(bits):
+    return 8 * (1 - 2 * bits.astype(np.float32))
 
 
 @pytest.mark.parametrize(("length", "rate"), [(256, 0.5), (960, 0.5), (2040, 0.5), (2048, 0.8), (4100, 0.3)])
 def test_every_codeword_has_the_roots_of_the_generator(length, rate):
-    code = ReedSolomon(rate=rate).compile(length)
-    message = message_of(code.message_bits)
-    coded = code.encode(message)
-    size = length // 8
-    words = -(-size // 255)
+    code, message, sent, places = coded(length, rate=rate)
     data = code.message_bits // 8 + 3
-    assert_array_equal(coded[: 8 * data], [*message, *crc24(message)])
-    parity = (size - data) // words
-    assert data / size <= rate < (data + words) / size
-    for word in words_of(np.packbits(coded)[:size], words, data):
+    assert_array_equal(sent[: 8 * data], [*message, *crc24(message)])
+    assert data / (length // 8) <= rate < (data + len(places)) / (length // 8)
+    for own, parity in places:
+        word = np.packbits(sent)[np.concatenate([own, parity])]
         assert len(word) <= 255
         root = 1
-        for _ in range(parity):
+        for _ in parity:
             assert at(word, root) == 0
             root = product(root, 2)
 
@@ -63,38 +61,30 @@ def test_every_codeword_has_the_roots_of_the_generator(length, rate):
 @pytest.mark.parametrize("length", [256, 960, 2600])
 def test_half_the_parity_in_wrong_bytes(length):
     """As many wrong bytes in each codeword as half its parity, as sure as the others; one more is lost."""
-    code = ReedSolomon().compile(length)
-    size = length // 8
-    words = -(-size // 255)
-    data = code.message_bits // 8 + 3
-    parity = (size - data) // words
     rng = np.random.default_rng(1)
     for extra in (0, 1):
-        message = message_of(code.message_bits, extra)
-        sent = np.packbits(code.encode(message))
-        for word in range(words):
-            places = np.r_[np.arange(word, data, words), np.arange(data + word, data + words * parity, words)]
-            wrong = rng.choice(places, parity // 2 + extra, replace=False)
-            sent[wrong] ^= rng.integers(1, 256, len(wrong)).astype(np.uint8)
-        received = np.unpackbits(sent)
+        code, message, sent, places = coded(length, extra)
+        received = np.packbits(sent)
+        for own, parity in places:
+            wrong = rng.choice(np.concatenate([own, parity]), len(parity) // 2 + extra, replace=False)
+            received[wrong] ^= rng.integers(1, 256, len(wrong)).astype(np.uint8)
+        received = np.unpackbits(received)
         found = code.decode(llr_of(received))
         assert found.ok == (not extra)
         if not extra:
             assert_array_equal(found.bits, message)
-            assert found.flipped == (received != code.encode(message)).sum()
+            assert found.flipped == (received != sent).sum()
 
 
 def test_bytes_that_were_not_received_or_are_unsure():
-    code = ReedSolomon().compile(960)
-    message = message_of(code.message_bits)
+    code, message, sent, _ = coded()
     rng = np.random.default_rng(2)
     for count, ok in ((52, True), (53, False)):
-        llr = llr_of(code.encode(message)).reshape(120, 8)
+        llr = llr_of(sent).reshape(120, 8)
         llr[rng.choice(120, count, replace=False)] = 0
         assert code.decode(llr.ravel()).ok == ok
-    llr = llr_of(code.encode(message)).reshape(120, 8)
-    wrong = rng.choice(120, 50, replace=False)
-    llr[wrong] *= -0.25
+    llr = llr_of(sent).reshape(120, 8)
+    llr[rng.choice(120, 50, replace=False)] *= -0.25
     found = code.decode(llr.ravel())
     assert found.ok
     assert_array_equal(found.bits, message)
@@ -102,14 +92,12 @@ def test_bytes_that_were_not_received_or_are_unsure():
 
 def test_what_is_no_number_says_nothing():
     """As with `polar`: 40 bytes that are NaN are erased; as received ones they are too many to correct."""
-    code = ReedSolomon().compile(960)
-    message = message_of(code.message_bits)
-    sent = np.packbits(code.encode(message))
+    code, message, sent, _ = coded()
     places = np.random.default_rng(2).permutation(120)
-    sent[places[40:48]] ^= 0xFF
-    llr = llr_of(np.unpackbits(sent))
-    llr.reshape(120, 8)[places[:40]] = np.nan
-    found = code.decode(llr)
+    llr = llr_of(sent).reshape(120, 8)
+    llr[places[40:48]] *= -1
+    llr[places[:40]] = np.nan
+    found = code.decode(llr.ravel())
     assert found.ok
     assert_array_equal(found.bits, message)
     assert found.flipped == 64

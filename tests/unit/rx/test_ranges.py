@@ -31,15 +31,16 @@ def bend_of(lean_deg, distance_m, noise_px, rng):
     return Bend(PLACES, off_px / one_px, np.full(len(PLACES), one_px**2))
 
 
-def drive(frames, sigma_m, bend_px, seed, *, said_m=None, start_m=50.0, speed_m_s=-10.0, lean_deg=0.0):
+def drive(frames, sigma_m, bend_px, seed, *, said_m=None, start_m=50.0, speed_m_s=-10.0, **how):
     """Errors and sigmas, float64 (frames, 2), of a drive whose distances err by `sigma_m`, said `said_m`."""
-    rng, late_chips = np.random.default_rng(seed), 8.0
+    rng, late_chips, lean_deg = np.random.default_rng(seed), 8.0, how.get("lean_deg", 0.0)
     true_m = start_m + speed_m_s * FRAME_US * 1e-6 * np.arange(frames)
     late_m = true_m + speed_m_s * late_chips * CHIP_US * 1e-6
     seen_m = late_m / math.cos(math.radians(lean_deg)) + sigma_m * rng.standard_normal(frames)
     bends = [bend_of(lean_deg, m, bend_px, rng) for m in true_m.tolist()]
     given = zip(seen_m.tolist(), bends, strict=True)
-    _, found = kept(Range(m, said_m or sigma_m, 15, late_chips, bend) for m, bend in given)
+    measured = (Range(m, said_m or sigma_m, 15, late_chips, bend) for m, bend in given)
+    _, found = kept(measured, how.get("sight", AHEAD))
     assert {one.pairs for one in found} == {15}
     return np.stack([[one.distance_m for one in found] - true_m, [one.sigma_m for one in found]], axis=1)
 
@@ -109,9 +110,16 @@ def test_sigmas_become_true(truth):
     assert 0.75 < nees(errors) < 1.35
 
 
-@pytest.mark.parametrize("lean_deg", [-5.0, -3.0, 0.0, 4.0])
-def test_a_lean_is_found_in_the_bend(lean_deg):
-    errors = np.stack([drive(60, 0.015, 0.04, seed, start_m=42.0, lean_deg=lean_deg) for seed in range(8)])
+@pytest.mark.parametrize(
+    ("lean_deg", "told_deg"), [(-5.0, None), (-3.0, None), (0.0, None), (4.0, None), (6.0, 4.0)]
+)
+def test_a_lean_is_found_in_the_bend(lean_deg, told_deg):
+    """Also by how much it differs from what an attitude tells, to 2 degrees."""
+    sight = AHEAD
+    if told_deg is not None:
+        sight = BarSight(sine=math.sin(math.radians(told_deg)), sigma=math.radians(2))
+    how = {"start_m": 42.0, "lean_deg": lean_deg, "sight": sight}
+    errors = np.stack([drive(60, 0.015, 0.04, seed, **how) for seed in range(8)])
     # A frame tells a lean to 2.5 degrees here: the first ten cannot tell a lean from none.
     assert 0.5 < nees(errors[:, 10:].reshape(-1, 2)) < 2
     # What is left of 1 - cos(lean), up to 0.16 m.
