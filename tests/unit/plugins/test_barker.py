@@ -90,9 +90,6 @@ def numbers(locks):
     return np.array([(lock.packet_t_us - START_US) / PERIOD_US for lock in locks])
 
 
-# Codes and kernels
-
-
 def test_more_clusters_than_codes_are_refused():
     with pytest.raises(ConfigError, match="27 clusters, expected at most 26"):
         Barker13Pilots().codes(27)
@@ -152,9 +149,6 @@ def test_noise_that_ends_at_once_is_no_preamble(rate_hz):
         rng, many = np.random.default_rng(seed), int(rate_hz * 0.06)
         t_us, p = np.sort(rng.integers(0, 60_000, many)), rng.integers(0, 2, many).astype(np.uint8)
         assert locks_of(t_us, p, listener, 1500)[0] == []
-
-
-# From which correlation on it is a preamble
 
 
 SLOW = {f"chips of {n}": np.repeat(chips_of_values(BARKER13), n) for n in (2, 3, 4)}
@@ -220,9 +214,6 @@ def test_a_preamble_of_sparse_pulses_is_one_lock_a_packet():
     assert_allclose([lock.packet_t_us for lock in locks], START_US + apart * np.arange(4), atol=50)
 
 
-# Timing
-
-
 @pytest.mark.parametrize(("ppm", "delay_us"), [(-50, (20, 45)), (0, (45, 20)), (50, (60, 10))])
 def test_packet_start_clock_and_delays(ppm, delay_us):
     rng = np.random.default_rng(ppm + 50)
@@ -244,9 +235,6 @@ def test_packet_start_clock_and_delays(ppm, delay_us):
         assert 0.8 < lock.quality <= 1
 
 
-# Steps
-
-
 def test_a_lock_does_not_wait_for_the_next_packet():
     rng, sync = np.random.default_rng(3), BarkerSync().compile(BOOK, FORMAT)
     t, p = events_of(packets_of(rng, 4), rng, ppm=30, missing_off=0.2)
@@ -256,18 +244,12 @@ def test_a_lock_does_not_wait_for_the_next_packet():
     assert len(locks) == 1
 
 
-# What is no preamble
-
-
 @pytest.mark.parametrize("events", [50, 5000])
 def test_a_flash_is_no_preamble(events):
     rng = np.random.default_rng(1)
     t = np.sort(rng.integers(20_000, 20_100, events))
     t = np.concatenate([[0], t, t + 300, [90_000]])
     assert locks_of(t, np.ones(len(t), np.uint8))[0] == []
-
-
-# Keeping a lock and finding it again
 
 
 def test_the_lock_is_kept_across_missing_preambles():
@@ -292,9 +274,6 @@ def test_the_second_preamble_after_a_jump_is_believed(jump_us):
     assert_allclose(numbers(locks), want, atol=2e-3)
     assert state.clock.packet == 4
     assert state.stray is None
-
-
-# Latency that changes, preambles that are half seen
 
 
 @pytest.mark.parametrize(("ppm", "by_us"), [(-60, 30), (0, 15), (60, 50)])

@@ -92,9 +92,6 @@ LINK = load_link()
 SHAPES = [(24, 20), (25, 21), (16, 17), (48, 40)]
 
 
-# Kernels
-
-
 def fit_peak(samples, size, band):
     """By samples of a row about no shift, and the same of a column."""
     half = len(samples) // 2
@@ -120,9 +117,6 @@ def test_a_noisy_peak_is_fitted_by_least_squares(seed):
 @pytest.mark.parametrize("samples", [[0, 0, 0], [-1, -2, -1], [0, 1, 0]])
 def test_no_peak_is_no_shift(samples):
     assert fit_peak(samples, 24, 23) == 0
-
-
-# Exact shifts
 
 
 @pytest.mark.parametrize("most", [None, (3, 4), (1, 2)])
@@ -170,9 +164,6 @@ def test_a_shift_in_noise_and_its_bound(spacing_px, noise):
     # Seen: 4.9 to 6.7, and 1.3 to 2.5.
     assert ratio["full"] > 4
     assert 1 < ratio["blob"] < 2.8
-
-
-# Ideal images
 
 
 def view_of(maps):
@@ -225,9 +216,6 @@ def test_distance_of_ideal_images(bar, blob, tolerance, tilt_deg, band):
     assert min(r.pairs for r in got) >= (16 if bar is BAR else 5)
 
 
-# What is left out
-
-
 @pytest.mark.parametrize(
     ("dark", "pairs"),
     [((1, 2, 3), 21), (range(4, 12), 9), (range(5, 13), 8), ((*range(4), *range(11, 16)), 6)],
@@ -248,6 +236,9 @@ def test_a_cluster_out_of_place_is_dropped(cluster, down):
     assert found.distance_m == pytest.approx(50, rel=1.5e-3)
     assert abs(everything.distance_m / 50 - 1) > 2.5e-3
     assert everything.sigma_m > 2 * found.sigma_m
+    centroid = CentroidRanging().compile(CAMERA, BAR, LINK.codebook)(view_of(maps))
+    # Neither the ends nor it.
+    assert (centroid.distance_m, centroid.pairs) == (pytest.approx(50, rel=1.5e-3), 13)
 
 
 def test_sigma_is_the_error_that_noise_makes():

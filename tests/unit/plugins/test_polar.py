@@ -52,9 +52,6 @@ def received(coded, bit_error_rate, rng):
     return (2 * (1.0 - 2.0 * coded + sigma * rng.normal(size=len(coded))) / sigma**2).astype(np.float32)
 
 
-# The code.
-
-
 def test_the_sequence_is_in_order():
     """A permutation that keeps the partial order of all channels (Schuerch 2016).
 
@@ -128,9 +125,6 @@ def test_a_code_decodes_at_least_what_has_no_errors_or_is_refused(length, rate):
     assert_array_equal(found.bits, message)
 
 
-# The decoder.
-
-
 def twin(llr, information, size):
     """Successive-cancellation list decoding as it is defined: every LLR from the start, input by input."""
 
@@ -193,9 +187,6 @@ def test_shortened_and_punctured_codes_against_brute_force(length, rate):
     assert decided > 75
 
 
-# Plausibility.
-
-
 def chernoff(weight, total):
     def bound(log_z):
         z = np.exp(log_z)
@@ -247,9 +238,6 @@ def test_a_scale_of_the_llrs_changes_nothing():
         assert_array_equal(found.bits, message)
     sure = (np.abs(llr) > 3) & ((llr < 0) == code.encode(message))
     assert_array_equal(code.decode(np.where(sure, np.inf * np.sign(llr), llr)).bits, message)
-
-
-# Frame errors.
 
 
 @pytest.mark.parametrize(("length", "blocks"), [(256, 1000), (960, 300)])

@@ -104,9 +104,6 @@ def presence_of(rng, *shape):
     return PresenceMap(probability, 2, probability > 0.5, np.zeros(0, np.float32))
 
 
-# Separation
-
-
 @pytest.mark.parametrize("shape", [(5, 4), (2, 2), (0, 3), (33, 7)])
 @pytest.mark.parametrize("grid", [2, 3])
 @pytest.mark.parametrize("density", [0.0, 0.1, 0.7])
@@ -119,9 +116,6 @@ def test_presence_is_bayes_rule(shape, grid, density):
     assert_allclose(found.probability, want, rtol=1e-5, atol=2e-9)
     assert found.probability.shape == (CLUSTERS, shape[0] // grid, shape[1] // grid)
     assert_array_equal(found.selected, found.probability >= 0.5)
-
-
-# Decoding
 
 
 def bits_of(symbols, bits):

@@ -108,8 +108,6 @@ def test_a_lock_near_the_grid_moves_it_and_another_begins_anew(form, late_us):
         assert after[0].packet in (0, 1)
 
 
-# Rows that come late
-
 PREAMBLE = LINK.codebook.preamble * 2.0 - 1
 BAR, EVENTS = lit(2, cluster_px=12.0)
 HEIGHT_PX = 16 * 12.0
