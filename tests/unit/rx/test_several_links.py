@@ -100,30 +100,18 @@ def test_links_that_cannot_be_received_together_are_refused(links, said):
         Receiver(links)
 
 
-LAMP_TABLE = "[bar]\nrows = 1\ncolumns = 1\ncluster_rows = 1\ncluster_columns = 1\n[ranging]\nid = 'none'\n"
-
-
-def lamps_received(folder, scene, *others):
-    """What is summed up of a simulated scene with a lamp, received by its link and by others."""
-    (folder / "lamp.toml").write_text(LAMP_TABLE)
-    (folder / "scene.toml").write_text(scene)
-    simulate(folder / "scene.toml").save(folder / "scene.raw")
-    lamp = replace(load_link(folder / "lamp.toml"), name="lamp")
-    return receive_to_folder(folder / "scene.raw", None, [*others, lamp])
-
-
 @pytest.mark.parametrize("seed", [0, 2])
 def test_what_one_lamp_s_link_rejects_in_a_bar_is_the_bar_s(seed, tmp_path):
     """A link of one cluster reads each part of a bar as a lamp, until the bar holds its place.
 
     In the second scene a region's last frames show that it is a part of another.
     """
-    summary = lamps_received(
-        tmp_path,
-        f"name = 'two'\nduration_s = 0.15\nseed = {seed}\n[motion]\ndistance_m = 40.0\n"
-        "[[bars]]\nx_m = -1.0\n[[bars]]\nx_m = 1.5\nlink = 'lamp.toml'\n",
-        BAR,
-    )
+    table, raw = tmp_path / "lamp.toml", tmp_path / "scene.raw"
+    one = "".join(f"{name} = 1\n" for name in ("rows", "columns", "cluster_rows", "cluster_columns"))
+    table.write_text(f"ranging.id = 'none'\n[bar]\n{one}")
+    bars = [{"x_m": -1.0}, {"x_m": 1.5, "link": str(table)}]
+    simulate({"duration_s": 0.15, "motion": {"distance_m": 40.0}, "bars": bars}, seed=seed).save(raw)
+    summary = receive_to_folder(raw, None, [BAR, replace(load_link(table), name="lamp")])
     of_lamp = summary["links"]["lamp"]["counts"]
     assert of_lamp["frames"] > 30
     assert of_lamp["frames_of_others"] > 80
