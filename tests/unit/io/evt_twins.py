@@ -1,41 +1,35 @@
 """EVT2 and EVT3 decoded word by word in plain Python, straight from the description of the formats."""
 
 import struct
-from dataclasses import dataclass, field
 
 
-@dataclass
 class Decoded:
-    """What a stream holds: events (t, x, y, p), triggers (t, channel, value), and what went wrong."""
+    """What a stream holds: events (t, x, y, p), triggers (t, channel, value), and what went wrong.
 
-    events: list[tuple[int, int, int, int]] = field(default_factory=list)
-    triggers: list[tuple[int, int, int]] = field(default_factory=list)
-    losses: dict[str, tuple[int, int]] = field(
-        default_factory=dict
-    )  # kind -> count, byte offset of the first
-    rollovers: int = 0
-    early: int = 0  # steps back over a rollover
-    last: int = 0
+    Losses by kind are how many, and the byte offset of the first.
+    """
 
-    def lose(self, kind, at, count=1):
+    def __init__(self):
+        self.events, self.triggers, self.losses = [], [], {}
+        self.rollovers = self.last = 0
+        self.early = 0  # steps back over a rollover
+
+    def lose(self, kind, at):
         before, first = self.losses.get(kind, (0, at))
-        self.losses[kind] = (before + count, first)
+        self.losses[kind] = (before + 1, first)
+
+    def add(self, rows, row, at):
+        if row[0] < self.last:
+            self.lose("time_backward", at)
+        else:
+            self.last = row[0]
+            rows.append(row)
 
     def add_event(self, t, x, y, p, at, width, height):
         if x >= width or y >= height:
             self.lose("outside_sensor", at)
-        elif t < self.last:
-            self.lose("time_backward", at)
         else:
-            self.last = t
-            self.events.append((t, x, y, p))
-
-    def add_trigger(self, t, channel, value, at):
-        if t < self.last:
-            self.lose("time_backward", at)
-        else:
-            self.last = t
-            self.triggers.append((t, channel, value))
+            self.add(self.events, (t, x, y, p), at)
 
 
 def judged(words, k, bits, low_bits, before):
@@ -118,7 +112,7 @@ def decode_evt3(data, width, height, start=0):
         elif kind == 0xA and doubt:
             out.lose("time_doubtful", at)
         elif kind == 0xA:
-            out.add_trigger(t, value >> 8 & 0xF, value & 1, at)
+            out.add(out.triggers, (t, value >> 8 & 0xF, value & 1), at)
         elif kind in (0x1, 0x9, 0xB, 0xC, 0xD):
             out.lose("reserved_words", at)
     if vector_left:
@@ -147,7 +141,7 @@ def decode_evt2(data, width, height, start=0):
         elif kind in (0x0, 0x1):
             out.add_event(t, word >> 11 & 0x7FF, word & 0x7FF, kind, at, width, height)
         elif kind == 0xA:
-            out.add_trigger(t, word >> 8 & 0x1F, word & 1, at)
+            out.add(out.triggers, (t, word >> 8 & 0x1F, word & 1), at)
         elif kind not in (0xE, 0xF):
             out.lose("reserved_words", at)
     return out
