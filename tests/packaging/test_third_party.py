@@ -111,7 +111,8 @@ def environment(tmp_path):
     shutil.rmtree(made.folder)
 
 
-def the_wheels_are_imported_and_found(environment):
+def test_a_strangers_package_is_as_good_as_a_built_in(environment):
+    """One test: to build the wheels and install them takes most of its time."""
     modules = ("evlcp_sdk", "evlcp_wh", "firmware_host", "evlcp_robust")
     code = f"import {', '.join(modules)}; print(*(m.__file__ for m in ({', '.join(modules)})), sep='\\n')"
     paths = environment.run("python", "-c", code).splitlines()
@@ -121,21 +122,15 @@ def the_wheels_are_imported_and_found(environment):
     assert plugins["ranging", "poc"][0] == "evlcp-sdk"
     assert plugins["ranging", "median-pairs"] == ("evlcp-robust", "1.2.0")
     assert plugins["decoding", "majority"] == ("evlcp-robust", "1.2.0")
-
-
-def its_algorithm_is_checked(environment):
+    # Its algorithm is checked, and its own tests pass.
     told = json.loads(environment.run("evlcp", "check", "ranging", "median-pairs", "--json"))
     assert (told["distribution"], told["version"]) == ("evlcp-robust", "1.2.0")
     assert {law["status"] for law in told["laws"]} == {"ok"}
-
-
-def its_own_tests_pass(environment, folder):
-    said = environment.run("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=folder)
-    assert " passed" in said
-    assert "skipped" not in said
-
-
-def its_algorithms_and_its_format_are_used(environment):
+    for folder in (EXAMPLE, FORMATS):
+        said = environment.run("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=folder)
+        assert " passed" in said
+        assert "skipped" not in said
+    # Its algorithms and its format are used.
     out = environment.folder / "out"
     sets = ("ranging.id=median-pairs", "ranging.min_spacing=0.4", "decoding.id=majority")
     options = ("--sink", "distance-lines", *(x for s in sets for x in ("--set", s)))
@@ -153,24 +148,12 @@ def its_algorithms_and_its_format_are_used(environment):
     assert bar["frames_found"] == bar["frames_sent"] > 10
     assert bar["ber"] < 0.02
     assert bar["rmse_m"] < 0.5
-
-
-def uninstalled_they_are_gone(environment):
+    # Uninstalled they are gone.
     environment.pip("uninstall", "evlcp-roadside", "evlcp-robust")
-    out = environment.folder / "none"
-    said = environment.run("evlcp", "receive", RECORDING, "-o", out, "--sink", "distance-lines", code=2)
+    none = environment.folder / "none"
+    said = environment.run("evlcp", "receive", RECORDING, "-o", none, "--sink", "distance-lines", code=2)
     assert "no sink named 'distance-lines'" in said
-    assert not out.exists()
+    assert not none.exists()
     assert ("ranging", "median-pairs") not in environment.plugins()
     said = environment.run("evlcp", "config", "--set", "ranging.id=median-pairs", code=2)
     assert "no ranging algorithm named 'median-pairs'" in said
-
-
-def test_a_strangers_package_is_as_good_as_a_built_in(environment):
-    """One test: to build the wheels and install them takes most of its time."""
-    the_wheels_are_imported_and_found(environment)
-    its_algorithm_is_checked(environment)
-    its_own_tests_pass(environment, EXAMPLE)
-    its_own_tests_pass(environment, FORMATS)
-    its_algorithms_and_its_format_are_used(environment)
-    uninstalled_they_are_gone(environment)
