@@ -15,11 +15,8 @@ import threading
 import time
 from collections import deque
 from pathlib import Path
-from typing import Any
 
-GLib: Any = None
-UMockdev: Any = None
-
+GLib = UMockdev = None
 
 SUBMIT, REAP, REAP_NDELAY, DISCARD = 0x8038550A, 0x4008550C, 0x4008550D, 0x550B
 CAPABILITIES, GET_DRIVER, CLAIM, RELEASE, SPEED = 0x8004551A, 0x41045508, 0x8004550F, 0x80045510, 0x551F
@@ -109,17 +106,11 @@ class Camera:
                 self.waiting.remove(found)
                 self.done.append((found, b"", -ENOENT))
             client.complete(*((0, 0) if found else (-1, EINVAL)))
-        elif request == CAPABILITIES:
-            client.get_arg().resolve(0, 4).update(0, struct.pack("<I", 0x01 | 0x04 | 0x10))
-            client.complete(0, 0)
-        elif request == GET_DRIVER:
-            client.complete(-1, ENODATA)
-        elif request == SPEED:
-            client.complete(5, 0)
-        elif request >> 8 & 0xFF == ord("U"):
-            client.complete(0, 0)
         else:
-            client.complete(-1, ENOTTY)
+            if request == CAPABILITIES:
+                client.get_arg().resolve(0, 4).update(0, struct.pack("<I", 0x01 | 0x04 | 0x10))
+            other = (0, 0) if request >> 8 & 0xFF == ord("U") else (-1, ENOTTY)
+            client.complete(*{GET_DRIVER: (-1, ENODATA), SPEED: (5, 0)}.get(request, other))
         return True
 
     def submit(self, urb):
@@ -132,7 +123,7 @@ class Camera:
         elif endpoint == 0x02:
             data = bytes(urb.resolve(16, length).retrieve())
             self.answers.append(self.answer(data))
-            self.done.append((one, length, 0))
+            self.done.append((one, data, 0))
         elif endpoint == 0x82:
             self.done.append((one, self.answers.popleft() if self.answers else b"", 0))
         elif self.registers[OUTPUT] & OUTPUT_OFF:
@@ -195,14 +186,10 @@ class Camera:
                 GLib.timeout_add(1, lambda: client.complete(-1, ENODEV if self.gone else EAGAIN))
             return
         (urb, endpoint, _length), data, status = self.done.popleft()
-        if isinstance(data, int):
-            size = data
-        else:
-            size = len(data)
-            if size:
-                urb.resolve(16, size).update(0, data)
-            if endpoint in (0x80, 0x00):
-                size = max(size - 8, 0)
+        if data:
+            urb.resolve(16, len(data)).update(0, data)
+        # A control transfer begins with its set-up.
+        size = max(len(data) - 8, 0) if endpoint in (0x80, 0x00) else len(data)
         urb.update(4, struct.pack("<i", status))
         urb.update(28, struct.pack("<i", size))
         client.get_arg().resolve(0, 8).set_ptr(0, urb)

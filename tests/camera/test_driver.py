@@ -281,9 +281,8 @@ def test_masks_leave_the_areas():
 
     kind = neuromorphic_drivers.prophesee_evk4
     masks = camera._masks("camera:", kind, [(10, 20, 30, 40), (100, 0, 5, 5)])
-    bits = lambda words: np.unpackbits(  # noqa: E731
-        np.array(words, "<u8").view(np.uint8), bitorder="little"
-    )
-    columns, rows = bits(masks["x_mask"])[:1280], bits(masks["y_mask"])[:720][::-1]
+    words = (np.array(masks[name], "<u8").view(np.uint8) for name in ("x_mask", "y_mask"))
+    columns, rows = (np.unpackbits(one, bitorder="little") for one in words)
+    columns, rows = columns[:1280], rows[:720][::-1]
     assert np.flatnonzero(columns == 0).tolist() == [*range(10, 40), *range(100, 105)]
     assert np.flatnonzero(rows == 0).tolist() == [*range(5), *range(20, 60)]
