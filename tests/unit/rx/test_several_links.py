@@ -110,7 +110,8 @@ def test_what_one_lamp_s_link_rejects_in_a_bar_is_the_bar_s(seed, tmp_path):
     one = "".join(f"{name} = 1\n" for name in ("rows", "columns", "cluster_rows", "cluster_columns"))
     table.write_text(f"ranging.id = 'none'\n[bar]\n{one}")
     bars = [{"x_m": -1.0}, {"x_m": 1.5, "link": str(table)}]
-    simulate({"duration_s": 0.15, "motion": {"distance_m": 40.0}, "bars": bars}, seed=seed).save(raw)
+    scene = {"duration_s": 0.15, "seed": seed, "motion": {"distance_m": 40.0}, "bars": bars}
+    simulate(scene).save(raw)
     summary = receive_to_folder(raw, None, [BAR, replace(load_link(table), name="lamp")])
     of_lamp = summary["links"]["lamp"]["counts"]
     assert of_lamp["frames"] > 30
