@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from evlcp_sdk import _kernels as shared_kernels
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.values import Events
@@ -132,3 +133,13 @@ def test_flanks_are_as_wide_as_they_are():
         ]
         assert np.mean(found) == pytest.approx(0.7 * width, rel=1e-3)
     assert math.isnan(_kernels.flank_px(np.zeros(5)))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8, 63, 64])
+def test_the_median_is_that_of_numpy(n):
+    rng = np.random.default_rng(n)
+    spread, alike = rng.normal(size=80), rng.integers(0, 4, 80).astype(float)
+    for values in (spread, alike, np.sort(spread), np.sort(alike)[::-1].copy(), np.ones(80)):
+        before = values.copy()
+        assert shared_kernels.median(values, n) == np.median(values[:n])
+        assert (values == before).all()
