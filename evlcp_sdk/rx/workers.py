@@ -122,7 +122,7 @@ class _Worker:
     def send(self, *request: Any) -> None:
         """Send what has no answer."""
         try:
-            # A pipe's own `send` has picklers made in Python, which take twice as long.
+            # A pipe's own `send` makes a pickler in Python each time.
             self._pipe.send_bytes(pickle.dumps(request))
         except BlockingIOError as fault:
             raise self._stalled(_STALL_S) from fault
