@@ -135,7 +135,7 @@ def sort_out(
 
 @njit
 def median(values: Array, n: int) -> float:
-    """Median of the first n values. NumPy's takes a second to compile."""
+    """Median of the first n values. NumPy's takes three seconds to compile."""
     some, middle, first, last = np.empty(n), n // 2, 0, n - 1
     for i in range(n):
         some[i] = values[i]
