@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_whole
-from evlcp_sdk.spelling import nearest
+from evlcp_sdk.suggestions import nearest
 
 T = TypeVar("T")
 Model = TypeVar("Model", bound=BaseModel)

@@ -467,7 +467,7 @@ class ReceivedMessage:
         """What a beacon says; None for other kinds."""
         return self.value if self.message.kind == Kind.BEACON else None
 
-    def said(self, most: int = 60) -> str:
+    def summary(self, most: int = 60) -> str:
         """What it says, the first `most` characters at least, for people to read."""
         if self.beacon is not None:
             latitude_deg, longitude_deg, height_m = self.beacon.place
@@ -480,7 +480,7 @@ class ReceivedMessage:
         return f"{self.kind.name} {value if len(value) <= most else f'{value[:most]}...'}"
 
     def __repr__(self) -> str:
-        who = f"{self.said()} from {self.message.transmitter_id}, {self.trust}"
+        who = f"{self.summary()} from {self.message.transmitter_id}, {self.trust}"
         return f"ReceivedMessage({who}, {self.t_us / 1e3:.1f} ms)"
 
 
@@ -536,7 +536,7 @@ class Packet:
         )
         head = "".join(f"<th>{name}</th>" for name in ("frame", "ms", "symbols", "quality", "distance"))
         messages = "".join(
-            f"<li>{escape(f'{m.said()} from {m.message.transmitter_id}, {m.trust}')}</li>"
+            f"<li>{escape(f'{m.summary()} from {m.message.transmitter_id}, {m.trust}')}</li>"
             for m in self.messages
         )
         return (

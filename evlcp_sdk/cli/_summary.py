@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from evlcp_sdk.cli._common import console, print_json
 from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.cli._tables import print_table
-from evlcp_sdk.spelling import counted
+from evlcp_sdk.suggestions import counted
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, print_json
-from evlcp_sdk.spelling import counted
+from evlcp_sdk.suggestions import counted
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.calibration import Calibrated

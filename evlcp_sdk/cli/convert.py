@@ -9,7 +9,7 @@ import typer
 
 from evlcp_sdk.cli._common import Json, bytes_bar, echo, print_json
 from evlcp_sdk.cli._complain import complain
-from evlcp_sdk.spelling import counted
+from evlcp_sdk.suggestions import counted
 
 
 def convert(

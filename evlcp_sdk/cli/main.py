@@ -55,7 +55,7 @@ def main() -> None:
         code = _INTERRUPTED
         complain("interrupted")
     except BaseException as fault:
-        code = _told(fault)
+        code = _report_fault(fault)
     sys.unraisablehook = before
     if not _stdout_took_all() and not code:
         code = _FAILED
@@ -71,7 +71,7 @@ def _interrupt(_frame: object, event: str, _of: object) -> None:
         raise KeyboardInterrupt
 
 
-def _told(fault: BaseException) -> int:
+def _report_fault(fault: BaseException) -> int:
     """Say what went wrong; the exit code."""
     from evlcp_sdk.errors import explained
 

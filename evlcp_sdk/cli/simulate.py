@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import Json, Overrides, console, echo, print_json, progress_bar
-from evlcp_sdk.spelling import counted
+from evlcp_sdk.suggestions import counted
 
 
 def simulate(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Found, in_ms
 from evlcp_sdk.diagnosis.tallies import SURE, TransmitterTally, count_missing_codewords
 from evlcp_sdk.rx.straight import ALIKE, err_together
-from evlcp_sdk.spelling import counted
+from evlcp_sdk.suggestions import counted
 
 FEW_FRAMES = 10
 """Frames of a packet by default: of fewer, nothing is said."""

@@ -11,7 +11,7 @@ from evlcp_sdk.clock import TimeGrain
 from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Found, has_rate, in_ms
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import alike_links
-from evlcp_sdk.spelling import counted
+from evlcp_sdk.suggestions import counted
 
 if TYPE_CHECKING:
     from evlcp_sdk.diagnosis.light import LightSource

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, Found
-from evlcp_sdk.spelling import counted
+from evlcp_sdk.suggestions import counted
 
 _MOST_IDS = 5
 """Ids that a warning names; how many there are besides, it counts."""

@@ -341,7 +341,7 @@ class RunTally:
                 "transmitter_id": one.message.transmitter_id,
                 "t_us": round(one.t_us, 2),
                 "trust": one.trust,
-                "said": one.said(_MOST_SAID),
+                "said": one.summary(_MOST_SAID),
             }
             for one in self._messages.values()
         ]

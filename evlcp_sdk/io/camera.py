@@ -15,7 +15,7 @@ from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import ChunkBytes, RawSource, format_header
 from evlcp_sdk.io.urls import flag, positive, split_options
 from evlcp_sdk.plugin.source import Loss
-from evlcp_sdk.spelling import nearest
+from evlcp_sdk.suggestions import nearest
 
 _KINDS: Final = {"PROPHESEE_EVK4": "prophesee_evk4", "PROPHESEE_EVK3_HD": "prophesee_evk3_hd"}
 """Of the driver's names those that send EVT3, and the module that configures each."""

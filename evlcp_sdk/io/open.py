@@ -16,7 +16,7 @@ from evlcp_sdk.io.replay import LoopSource, ReplaySource
 from evlcp_sdk.io.streams import SCHEMES, open_stream
 from evlcp_sdk.io.tables import CsvWriter, NpzWriter
 from evlcp_sdk.io.urls import flag, positive, split_options
-from evlcp_sdk.late import Late
+from evlcp_sdk.lazy import LazyModule
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.plugin.writer import EventWriter
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.io import camera, lists
 else:
     # What most runs do not read.
-    camera, lists = (Late(f"evlcp_sdk.io.{name}") for name in ("camera", "lists"))
+    camera, lists = (LazyModule(f"evlcp_sdk.io.{name}") for name in ("camera", "lists"))
 
 T = TypeVar("T")
 

@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io.evt import MAX_SIDE
-from evlcp_sdk.spelling import nearest
+from evlcp_sdk.suggestions import nearest
 
 
 def split_options(url: str, kinds: Mapping[str, Callable[[str], Any]]) -> tuple[str, dict[str, Any]]:

@@ -38,7 +38,7 @@ from evlcp_sdk.plugin.roles import (
 from evlcp_sdk.scene.bar import BarLayout, read_leds
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.specs import SpecError, build, parse_value, read_toml, shown
-from evlcp_sdk.spelling import hinted, nearest
+from evlcp_sdk.suggestions import hinted, nearest
 
 _SPECS: dict[str, type[Any]] = {
     "camera": CameraModel,

@@ -37,7 +37,7 @@ class Serializer:
     def __init__(self, links: Mapping[str, Link], sites: Sequence[BarSite] = ()) -> None:
         self._columns = frame_columns(filtered=False, links=len(links) > 1)
         self._sites = tuple(sites)
-        self._sites_told = not sites
+        self._sites_sent = not sites
         self._bars: dict[int, Frame] = {}
         self._shot = (-1, "", b"")
 
@@ -49,7 +49,7 @@ class Serializer:
             frames: Tell of frames, too; False where nobody looks on.
         """
         if news.kind != "frame":
-            return [(kind, json.dumps({"line": kind} | values)) for kind, values in self._told(news)]
+            return [(kind, json.dumps({"line": kind} | values)) for kind, values in self._lines_of(news)]
         self._keep(news.value)
         return [("frame", self._frame(news))] * frames
 
@@ -60,7 +60,7 @@ class Serializer:
         """
         if self._shot[0] != picture.number:
             latest = [one for one in self._bars.values() if one.t_us > picture.t_us - _LATEST_US]
-            self._shot = picture.number, _told(picture, latest), picture.image().png()
+            self._shot = picture.number, _picture_json(picture, latest), picture.image().png()
         return self._shot[1:]
 
     def _keep(self, frame: Frame) -> None:
@@ -68,7 +68,7 @@ class Serializer:
         if len(self._bars) > _MOST_BARS:
             del self._bars[min(self._bars, key=lambda number: self._bars[number].t_us)]
 
-    def _told(self, news: News) -> list[tuple[str, dict[str, Any]]]:
+    def _lines_of(self, news: News) -> list[tuple[str, dict[str, Any]]]:
         kind, value = news.kind, news.value
         if kind == "message":
             return [(kind, _shown(value))]
@@ -95,9 +95,9 @@ class Serializer:
 
     def _bars_of(self, fix: Fix) -> list[tuple[str, dict[str, Any]]]:
         """The bars in local metres, with the first fix that is given."""
-        if self._sites_told:
+        if self._sites_sent:
             return []
-        self._sites_told = True
+        self._sites_sent = True
         # The axes of a fix turn by 0.009 degrees a kilometre: nothing on a map.
         here = LocalAxes(fix.latitude_deg, fix.longitude_deg, fix.height_m)
         bars = []
@@ -116,14 +116,14 @@ def _shown(message: ReceivedMessage) -> dict[str, Any]:
         about = {name: getattr(message, name) for name in ("transmitter", "t_us", "trust")}
         ids = {"kind": message.kind.name, "transmitter_id": message.message.transmitter_id}
         return {**about, **ids, "said": f"cannot be shown: {fault}"}
-    return shown | {"said": message.said(_MOST_SAID)}
+    return shown | {"said": message.summary(_MOST_SAID)}
 
 
 def _not_a_number(name: str) -> None:
     raise ValueError(f"a message kind shows {name}, which JSON has not")
 
 
-def _told(picture: Picture, bars: Sequence[Frame]) -> str:
+def _picture_json(picture: Picture, bars: Sequence[Frame]) -> str:
     regions = [
         [one.id, *(round(v, 1) for v in (one.x_px, one.y_px, one.width_px, one.height_px))]
         for one in picture.regions

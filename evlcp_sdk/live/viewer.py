@@ -213,8 +213,8 @@ class Viewer(Server):
         self._browsers.add(browser)
         try:
             await socket.send(json.dumps(self._about()))
-            async for said in socket:
-                if not self._heard(browser, said):
+            async for request in socket:
+                if not self._take_request(browser, request):
                     await socket.close(1008, "not understood")
         except ConnectionClosed:
             pass  # It has gone.
@@ -224,10 +224,10 @@ class Viewer(Server):
         finally:
             self._browsers.discard(browser)
 
-    def _heard(self, browser: _Browser, said: str | bytes) -> bool:
-        """Do what a browser says, if it may; whether that was understood."""
+    def _take_request(self, browser: _Browser, request: str | bytes) -> bool:
+        """Do what a browser asks for, if it may; whether that was understood."""
         try:
-            asked = json.loads(said)
+            asked = json.loads(request)
         except ValueError:
             return False
         if asked == {"next": True}:

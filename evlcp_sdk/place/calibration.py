@@ -400,7 +400,7 @@ class _Model:
         seen = (stands - position) @ rotation
         block = np.zeros((len(place), 2, len(x)))
         block[:, :, :_OF_CAMERA] = now.parameter_slope(seen[:, :2] / seen[:, 2:]) @ self.root
-        # By turns of the whole, as if there were none yet: they are a few hundredths at the most.
+        slope[:, :, 3:] = slope[:, :, 3:] @ _turn_slope(off[3:])
         block[:, :, at : at + 6], block[:, :, -6:] = slope * own, slope * common
         for column, (mine, by_site) in moves.items():
             block[mine, :, column : column + 7] = -slope[mine][:, :, :3] @ by_site
@@ -443,3 +443,13 @@ def _site_slope(arm_m: Floats, survey: tuple[float, float, float]) -> Floats:
     moves[:, :, 3:6] = turn * np.cross(np.eye(3)[None], arm_m[:, None]).transpose(0, 2, 1)
     moves[:, :, 6] = length * arm_m
     return moves
+
+
+def _turn_slope(turn: Floats) -> Floats:
+    """Small turn of the whole by the parts of a rotation vector (the left Jacobian of the rotations)."""
+    angle = float(np.linalg.norm(turn))
+    cross = np.cross(np.eye(3), turn)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + cross / 2)
+    k = cross / angle
+    return np.asarray(np.eye(3) + (1 - math.cos(angle)) / angle * k + (1 - math.sin(angle) / angle) * (k @ k))

@@ -20,7 +20,7 @@ from evlcp_sdk.place.navigator import Navigator, Placed, Settled
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.spelling import counted
+from evlcp_sdk.suggestions import counted
 from evlcp_sdk.values import Packet
 
 Floats = NDArray[np.float64]

@@ -9,7 +9,7 @@ from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.hooks import SinkRecord
 from evlcp_sdk.plugin.registry import Owner, Registry, load_target
-from evlcp_sdk.spelling import nearest
+from evlcp_sdk.suggestions import nearest
 
 SUMMARY = "summary.json"
 """What every result has: no sink writes it."""

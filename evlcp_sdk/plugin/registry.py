@@ -21,7 +21,7 @@ from evlcp_sdk.errors import PluginError, PluginWarning, UnknownAlgorithmError
 from evlcp_sdk.plugin import hooks as hookspecs
 from evlcp_sdk.plugin.hooks import ENTRY_POINT_GROUP, Algorithm
 from evlcp_sdk.plugin.roles import ROLES
-from evlcp_sdk.spelling import nearest
+from evlcp_sdk.suggestions import nearest
 
 T = TypeVar("T")
 Owner = tuple[str, str]

@@ -30,7 +30,7 @@ from evlcp_sdk.report.recording import (
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
-from evlcp_sdk.spelling import counted
+from evlcp_sdk.suggestions import counted
 from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 _DPI = 150

@@ -29,7 +29,7 @@ from evlcp_sdk.report.recording import (
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
-from evlcp_sdk.spelling import counted
+from evlcp_sdk.suggestions import counted
 from evlcp_sdk.values import Frame, Packet, ReceivedMessage
 
 _MOST_MESSAGES = 50
@@ -104,7 +104,13 @@ class Report(Kept):
             places=places,
             placed=len(self.track) > 0,
             messages=[
-                (f"{axis.ms(m.t_us):.1f}", m.kind.name, m.message.transmitter_id, m.trust, m.said(_MOST_SAID))
+                (
+                    f"{axis.ms(m.t_us):.1f}",
+                    m.kind.name,
+                    m.message.transmitter_id,
+                    m.trust,
+                    m.summary(_MOST_SAID),
+                )
                 for m in messages
             ],
             left_out=self._many_messages - len(messages),

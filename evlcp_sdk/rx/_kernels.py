@@ -372,7 +372,7 @@ def select_boxes(
             rows[v] |= np.uint16(1 << k)
     ends = np.empty(MOST_BOXES + 1, np.int64)
     for k in range(ends.size):
-        ends[k] = k * apart
+        ends[k] = min(k, len(boxes)) * apart
     for i in range(t_us.size):
         inside = columns[x[i]] & rows[y[i]]
         if inside & filtered:

@@ -18,7 +18,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Filter, Tracker
-from evlcp_sdk.spelling import hinted
+from evlcp_sdk.suggestions import hinted
 from evlcp_sdk.values import Bend, PresenceMap, Range, SoftSymbols, SyncLock
 
 _FAR_PACKETS = 64
@@ -74,13 +74,13 @@ class Guard:
             PluginError: It does not pass.
         """
         if not isinstance(fault, self._passes):
-            raise PluginError(self._said(f": {fault_text(fault)}")) from fault
+            raise PluginError(self._message(f": {fault_text(fault)}")) from fault
 
     def refuse(self, gave: str, expected: str) -> NoReturn:
         """Raise what an algorithm gave, and what was expected, in words."""
-        raise PluginError(self._said(f": gave {gave}, expected {expected}"))
+        raise PluginError(self._message(f": gave {gave}, expected {expected}"))
 
-    def _said(self, what: str) -> str:
+    def _message(self, what: str) -> str:
         return hinted(f"{self._role} algorithm '{self._id}'{what}", self._role, self._id)
 
     def expect(self, found: object, kind: type) -> None:

@@ -181,8 +181,7 @@ class Rhythm:
         self._seen: int | None = None
         self._open_us, self._taken, self._rises = -1, 0, 0
         self._shared = shared
-        # Where events are selected into, box by box, so many places apart.
-        self._apart = -1
+        # Where events are selected into, box by box.
         self._columns: _kernels.Columns = (np.empty(0),) * 4
         self._kept: tuple[tuple[int, int], int, NDArray[np.int16]] | None = None
 
@@ -237,12 +236,12 @@ class Rhythm:
         if len(boxes) > most:
             first = self.select(events, boxes[:most], rhythmic[:most], most_same)
             return first + self.select(events, boxes[most:], rhythmic[most:], most_same)
-        if events.t_us.size > self._apart:
-            self._apart = events.t_us.size + events.t_us.size // 4
-            room = most * self._apart + 1
+        columns, apart = (events.t_us, events.x, events.y, events.p), events.t_us.size
+        room = len(boxes) * apart + 1
+        if room > self._columns[0].size:
+            room += room // 4
             into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
             self._columns = into
-        columns, apart = (events.t_us, events.x, events.y, events.p), self._apart
         if len(boxes) == 1 and not rhythmic[0]:
             # Of a bar alone, whole blocks of events.
             ends = [_kernels.select_box(columns, boxes[0], self._columns)]

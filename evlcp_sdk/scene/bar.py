@@ -15,7 +15,7 @@ from pydantic import Field
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import read_table
 from evlcp_sdk.specs import SpecError, build, shown
-from evlcp_sdk.spelling import nearest
+from evlcp_sdk.suggestions import nearest
 
 _MOST_LEDS = 1 << 16
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
+from evlcp_sdk.lazy import LazyModule
 
 if TYPE_CHECKING:
     from scipy import special
 else:
-    special = Late("scipy.special")
+    special = LazyModule("scipy.special")
 
 Floats = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from pydantic import Field
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.specs import SpecError, build, read_toml, toml_value
-from evlcp_sdk.spelling import nearest
+from evlcp_sdk.suggestions import nearest
 
 _LEAST_UPRIGHT = 0.1
 """Sine of an axis' elevation below which it lies: LEDs then face level, whatever they are turned about it."""

@@ -24,7 +24,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.specs import SpecError, build, parse_toml, parse_value, read_toml
-from evlcp_sdk.spelling import counted, nearest
+from evlcp_sdk.suggestions import counted, nearest
 
 MOST_PIXELS = 4096
 """Columns and rows of a sensor."""

@@ -18,7 +18,7 @@ from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim.motion import CameraPath
 from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec, links_of
-from evlcp_sdk.spelling import counted
+from evlcp_sdk.suggestions import counted
 
 Floats = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
     return tuple(sites)
 
 
-def sites_said(scene: Scene, seed: int, registry: Registry | None = None) -> tuple[BarSite, ...]:
+def surveyed_sites(scene: Scene, seed: int, registry: Registry | None = None) -> tuple[BarSite, ...]:
     """The same as a survey says them: with its errors, and with what is wrong without anybody's knowledge.
 
     Args:

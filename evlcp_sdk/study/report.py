@@ -12,7 +12,6 @@ from markupsafe import Markup
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS
 from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.report.plots import DASHES, INK, SCRIPT, Plot
-from evlcp_sdk.spelling import counted
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, INTERVALS, Figure, measure, number_text
 from evlcp_sdk.study.plan import digest_of
 from evlcp_sdk.study.summary import (
@@ -27,6 +26,7 @@ from evlcp_sdk.study.summary import (
     verdict_of,
 )
 from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
+from evlcp_sdk.suggestions import counted
 
 Dash = Sequence[int]
 

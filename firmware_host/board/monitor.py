@@ -38,7 +38,7 @@ class Back:
 
 
 @dataclass(frozen=True)
-class Unheard:
+class KeyMissing:
     """The board's watchdog acts all the same: it has a key, and this host speaks without."""
 
 
@@ -49,10 +49,10 @@ def watch(
     reconnect: bool = True,
     at_first: bool = False,
     end: threading.Event | None = None,
-) -> Iterator[StatusReply | Gone | Back | Unheard]:
+) -> Iterator[StatusReply | Gone | Back | KeyMissing]:
     """What a board says, every `interval_s`; in between its watchdog does not act, as it hears of this host.
 
-    A board with a key hears only of a host that has it, too; otherwise `Unheard` comes once.
+    A board with a key hears only of a host that has it, too; otherwise `KeyMissing` comes once.
 
     Args:
         opened: Opens the line to the board.
@@ -83,7 +83,7 @@ def watch(
                 keyless = any(board.about.key_name) and board.session.key is None
                 if keyless and status.watchdog != Watchdog.KEEP and not told:
                     told = True
-                    yield Unheard()
+                    yield KeyMissing()
                 yield status
                 seen += 1
                 if seen == count:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from firmware_host.board.bank import Bank
     from firmware_host.board.board import Board
     from firmware_host.board.fleet import Entry
-    from firmware_host.board.monitor import Back, Gone, Unheard
+    from firmware_host.board.monitor import Back, Gone, KeyMissing
     from firmware_host.protocol.generated.requests import StatusReply
 
 app = typer.Typer(
@@ -494,10 +494,10 @@ def _watch_fleet(
             ended.set()
 
 
-def _print_seen(seen: StatusReply | Gone | Back | Unheard, which: dict[str, Any], as_json: bool) -> None:
+def _print_seen(seen: StatusReply | Gone | Back | KeyMissing, which: dict[str, Any], as_json: bool) -> None:
     """A line of `monitor`: of a board that is there on stdout, of one that goes and comes on stderr."""
     from evlcp_sdk.cli._complain import complain
-    from firmware_host.board.monitor import Back, Gone, Unheard
+    from firmware_host.board.monitor import Back, Gone, KeyMissing
     from firmware_host.board.tables import name_of, status_table
     from firmware_host.protocol.generated.requests import State
 
@@ -510,7 +510,7 @@ def _print_seen(seen: StatusReply | Gone | Back | Unheard, which: dict[str, Any]
         if as_json:
             print_json(which | {"back_after_s": round(seen.after_s, 3)})
         complain(f"{name}: answers again after {seen.after_s:.1f} s")
-    elif isinstance(seen, Unheard):
+    elif isinstance(seen, KeyMissing):
         complain(f"{name}: has a key: without it (--key) this host does not keep its watchdog from acting")
     elif as_json:
         print_json(which | status_table(seen))

@@ -200,7 +200,7 @@ def message(
         outputs.commit()
     written = [str(path) for path in (out, chips) if path is not None]
     line = board.line(only_named=bool(written))
-    said = _said(summary, written)
+    said = _describe(summary, written)
     if line is None:
         say(said, summary | {"board": None} | table, as_json)
         if not written and not as_json:
@@ -270,7 +270,7 @@ def _compose(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int6
     }
 
 
-def _said(summary: dict[str, Any], written: list[str]) -> str:
+def _describe(summary: dict[str, Any], written: list[str]) -> str:
     """What was put on packets, and where they are, for a person."""
     lines = [
         f"{m['kind']:9} {m['bytes']:5} bytes, transmitter {m['transmitter_id']}, sequence {m['sequence']}"

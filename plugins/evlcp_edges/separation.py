@@ -10,14 +10,14 @@ from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.late import Late
+from evlcp_sdk.lazy import LazyModule
 from evlcp_sdk.plugin.roles import Separate, Separation
 from evlcp_sdk.values import PresenceMap
 
 if TYPE_CHECKING:
     from scipy import ndimage
 else:
-    ndimage = Late("scipy.ndimage")
+    ndimage = LazyModule("scipy.ndimage")
 
 
 @dataclass(frozen=True)

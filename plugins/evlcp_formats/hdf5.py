@@ -13,9 +13,9 @@ from evlcp_sdk.io.arrays import Array, choose_columns, pieces_of
 from evlcp_sdk.io.columns import WINDOW_US, ColumnSource, EventTable, one_line
 from evlcp_sdk.io.fields import Fields, fields_of, unit_named
 from evlcp_sdk.io.urls import flag, split_options
-from evlcp_sdk.late import Late
+from evlcp_sdk.lazy import LazyModule
 
-h5py: Any = Late("h5py")
+h5py: Any = LazyModule("h5py")
 
 _PLACES: Final = ("events", "raw_events", "CD/events")
 _ECF: Final = 36559

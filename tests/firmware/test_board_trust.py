@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 
 from firmware_host.board.board import Settings, provision
 from firmware_host.board.keys import make_board_key, read_board_key
-from firmware_host.board.monitor import Unheard, watch
+from firmware_host.board.monitor import KeyMissing, watch
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import RefusedError
 from firmware_host.protocol.datagram import Datagram, DatagramDecoder
@@ -191,7 +191,7 @@ def test_a_monitor_without_the_key_says_that_the_watchdog_acts(device):
     assert kinds(None) == [StatusReply] * 2
     locked(device)
     assert kinds(KEY) == [StatusReply] * 2
-    assert kinds(None) == [Unheard, *[StatusReply] * 2]
+    assert kinds(None) == [KeyMissing, *[StatusReply] * 2]
     board_on(device, key=KEY).watchdog(Watchdog.KEEP, 0)
     assert kinds(None) == [StatusReply] * 2
 

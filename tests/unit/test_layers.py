@@ -11,7 +11,7 @@ SDK = ROOT / "evlcp_sdk"
 
 ROWS = {
     "evlcp_sdk": (
-        *("errors files kernels late printable signals specs spelling stopwatch", "air"),
+        *("errors files kernels lazy printable signals specs stopwatch suggestions", "air"),
         *("values scene clock utc _kernels", "plugin", "link", "io rx place sim", "formatting", "diagnosis"),
         *("results", "report", "study live", "run simulated warming", "testing", "cli"),
     ),

@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import stats
+from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.place.calibration import Calibrated, CalibrationView, calibrate, read_poses
+from evlcp_sdk.place.calibration import Calibrated, CalibrationView, _turn_slope, calibrate, read_poses
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel
@@ -142,6 +144,13 @@ def test_angles_that_are_all_wrong_are_not_the_principal_point() -> None:
     level = Attitude(0.07, 0.0, 0.0).rotation()
     with pytest.raises(ConfigError, match=r"centre_y_px = [\d.-]+ would fit .*, 360 is configured and 26 "):
         calibrate([dataclasses.replace(view, rotation=level) for view in seen], camera)
+
+
+@pytest.mark.parametrize("turn", [np.array([0.2, -0.3, 0.1]), np.full(3, 1e-9)])
+def test_the_slope_of_a_turn_is_the_numerical_one(turn: NDArray[np.float64]) -> None:
+    start = Rotation.from_rotvec(turn).inv()
+    want = approx_fprime(np.zeros(3), lambda d: (Rotation.from_rotvec(turn + d) * start).as_rotvec(), 1e-7)
+    np.testing.assert_allclose(_turn_slope(turn), want, atol=1e-6)
 
 
 def test_poses_are_read_and_their_faults_told(tmp_path: Path) -> None:

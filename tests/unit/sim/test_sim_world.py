@@ -12,7 +12,7 @@ from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.leds import lit_strips
 from evlcp_sdk.sim.motion import CameraPath, project
-from evlcp_sdk.sim.world import attitude_log, scene_to_enu, sites_said
+from evlcp_sdk.sim.world import attitude_log, scene_to_enu, surveyed_sites
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 137.2, "height_m": 40.0, "heading_deg": 30.0}
 MOTION = {"distance_m": 50.0, "yaw_deg": 2.0, "pitch_deg": -1.0, "roll_deg": 4.0}
@@ -102,18 +102,18 @@ def test_what_an_imu_does_not_know(known: str) -> None:
 
 
 def test_what_is_said_of_sites_is_wrong_as_told() -> None:
-    assert sites_said(SCENE, 5) == sites_of(SCENE)
+    assert surveyed_sites(SCENE, 5) == sites_of(SCENE)
     one, two, three = SCENE.bars
     swapped = (replace(one, site_of=1), replace(two, site_of=0, site_off_m=(0.3, -0.4, 1.2)), three)
     wrong = replace(SCENE, bars=swapped)
-    true, said = sites_of(wrong), sites_said(wrong, 5)
+    true, said = sites_of(wrong), surveyed_sites(wrong, 5)
     assert true == sites_of(SCENE)
     assert [s.transmitter_id for s in said] == [1, 77, 3]
     assert replace(said[0], transmitter_id=77) == true[1]
     assert said[2] == true[2]
     np.testing.assert_allclose(off_m(said[1], true[0]), [0.3, -0.4, 1.2], atol=1e-5)
     with pytest.raises(ConfigError, match=r"bars\.2\.site_of = 3: expected one of 3 bars"):
-        sites_said(replace(wrong, bars=(one, two, replace(three, site_of=3))), 5)
+        surveyed_sites(replace(wrong, bars=(one, two, replace(three, site_of=3))), 5)
 
 
 def off_m(said: BarSite, true: BarSite) -> tuple[float, float, float]:
@@ -125,7 +125,7 @@ def off_m(said: BarSite, true: BarSite) -> tuple[float, float, float]:
 def test_a_survey_errs_by_what_it_says() -> None:
     assert SCENE.world is not None
     scene = replace(SCENE, world=replace(SCENE.world, survey_sigma_m=0.2))
-    surveys = [sites_said(scene, seed) for seed in range(100)]
+    surveys = [surveyed_sites(scene, seed) for seed in range(100)]
     assert {site.position_sigma_m for survey in surveys for site in survey} == {0.2}
     errors = [off_m(*both) for survey in surveys for both in zip(survey, sites_of(scene), strict=True)]
     # 300 draws: the spread is known to 4 %.

@@ -26,7 +26,7 @@ from evlcp_sdk.sim import (
     truth_of,
 )
 from evlcp_sdk.sim.scene import WorldSpec
-from evlcp_sdk.sim.world import attitude_log, sites_said
+from evlcp_sdk.sim.world import attitude_log, surveyed_sites
 from evlcp_sdk.study.frames import FrameRow, read_frames
 from evlcp_sdk.study.match import check_link, match, nearest_bar
 from evlcp_sdk.study.measure import position_tallies, statistics_of
@@ -339,7 +339,7 @@ def test_faults_of_what_is_said_are_told_by_positions() -> None:
         assert scene.world is not None
         said = replace(scene, bars=(*bars, *scene.bars[len(bars) :]), world=replace(scene.world, **world))
         log = attitude_log(said, 0, simulation.path)
-        tallies = position_tallies(packets, truth, load_link(), log, sites_said(said, 0))
+        tallies = position_tallies(packets, truth, load_link(), log, surveyed_sites(said, 0))
         return Tally.together(tally for _, tally in tallies)
 
     right, up = positions(), positions([(0.0, 0.0, 0.5)])

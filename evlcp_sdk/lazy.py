@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import Any
 
 
-class Late:
+class LazyModule:
     """Stands for a module; after the first use a name of it costs what a name of any module does.
 
     An import in a function that runs a thousand times a second takes longer than some kernels.
