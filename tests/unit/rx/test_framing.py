@@ -11,7 +11,7 @@ from rx_streams import LINK, frames_of, lit, noise_events, received
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.alignment import polarity_sums
 from evlcp_sdk.rx.transmitters import PacketGrid, RowDelay, measure_row_delay
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.values import Events, SyncLock
 
 CHIP_US, ZERO_US = 100.5, 1234.5
@@ -132,15 +132,6 @@ def test_rows_that_are_read_late(row_us):
     assert sigma < 0.01
 
 
-def test_hidden_rows_and_noise_are_outliers():
-    events = read_late(EVENTS, 0.2)
-    hidden = (events.y > 300) & (events.y < 350)
-    early = (events.y > 400) & (events.y < 425)
-    moved = Events.of(events.t_us - 60 * early, events.x, events.y, events.p)[~hidden]
-    noisy = merged(moved, noise_events(2e6, 90_000))
-    assert measured(noisy)[0] == pytest.approx(0.2, abs=0.03)
-
-
 @pytest.mark.parametrize("events", [Events.empty(), EVENTS[:3], noise_events(1e8, 30_000)])
 def test_nothing_to_see_is_nothing_known(events):
     assert np.isnan(measured(events)).all()
@@ -171,7 +162,6 @@ def test_the_receiver_reads_a_bar_whose_ends_are_a_chip_apart(row_us):
 
 CHIPS, SIZE = 12, (8, 14)
 LOCK = SyncLock(packet_t_us=0, chip_us=100.25, delay_on_us=-20.5, delay_off_us=33.75, quality=1)
-STILL = np.repeat([[103.5], [206.5]], CHIPS, axis=1)
 
 
 def stream(seed, n=4000):
@@ -192,10 +182,6 @@ def plain_sums(events, start_on_us, start_off_us, chip_us, shift_x, shift_y, sha
     return sums
 
 
-def one(t_us, p, x=103, y=206):
-    return Events.of([t_us], [x], [y], [p])
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_a_moving_bar_is_held_in_the_middle(seed):
     rng = np.random.default_rng(seed)
@@ -211,27 +197,3 @@ def test_a_moving_bar_is_held_in_the_middle(seed):
     want = plain_sums(events, 1000 - 20.5, 1000 + 33.75, LOCK.chip_us, *shifts, shape)
     assert_array_equal(sums, want)
     assert sums.dtype == np.int16
-
-
-@pytest.mark.parametrize(("p", "delay_us"), [(1, -20.5), (0, 33.75)])
-def test_each_polarity_has_its_own_first_and_last_chip(p, delay_us):
-    first = 1000 + delay_us
-    end = first + CHIPS * LOCK.chip_us
-    for t, chip in [
-        (np.ceil(first) - 1, None),
-        (np.ceil(first), 0),
-        (np.ceil(end) - 1, CHIPS - 1),
-        (np.ceil(end), None),
-    ]:
-        sums, _ = polarity_sums([one(int(t), p)], LOCK, 1000.0, STILL, SIZE)
-        want = [] if chip is None else [[chip, 6, 3]]
-        assert np.argwhere(sums).tolist() == want, f"event at {t}"
-        assert sums.sum() == (0 if chip is None else 2 * p - 1)
-
-
-def test_no_events_are_no_sums():
-    for pieces in ([], [Events.empty()], [Events.empty(), one(10**9, 1), one(10**9, 0)]):
-        sums, offset = polarity_sums(pieces, LOCK, 1000.0, STILL, SIZE)
-        assert sums.shape == (CHIPS, SIZE[1], SIZE[0])
-        assert offset.shape == (2, CHIPS)
-        assert not sums.any()

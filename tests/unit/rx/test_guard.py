@@ -8,11 +8,8 @@ import numpy as np
 import pytest
 from rx_streams import lit
 
-from evlcp_sdk.errors import ConfigError, InputError, PluginError, PluginWarning
-from evlcp_sdk.io import open_source
+from evlcp_sdk.errors import ConfigError, InputError, PluginError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.plugin.hooks import hookimpl
-from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Corrected, Tracker
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Bend, SyncLock
@@ -82,11 +79,9 @@ def changed(role, change):
     ("role", "fault", "says"),
     [
         *((role, KeyError("boom"), "KeyError: 'boom'") for role in ROLES),
-        *((role, SystemExit(0), "SystemExit: 0") for role in ROLES),
-        ("ranging", GeneratorExit(), "GeneratorExit: "),
+        ("ranging", SystemExit(0), "SystemExit: 0"),
         ("ranging", MuteError(), "MuteError: a MuteError that cannot be shown"),
         ("ranging", InputError("liar.raw: damaged"), "InputError: liar.raw: damaged"),
-        ("ranging", ConfigError("no such key"), "ConfigError: no such key"),
     ],
 )
 def test_what_fails_in_a_frame_is_named(role, fault, says):
@@ -116,11 +111,8 @@ FUNCTION, METHODS = "a function", r"an object with init\(\) and step\(\)"
 @pytest.mark.parametrize(
     ("role", "gives", "says"),
     [
-        ("synchronization", None, rf"NoneType at compile\(\), expected {METHODS}"),
         ("synchronization", SimpleNamespace(init=None, step=fails), f"SimpleNamespace at .*{METHODS}"),
-        ("separation", None, rf"NoneType at compile\(\), expected {FUNCTION}"),
         ("decoding", 3, rf"int at compile\(\), expected {FUNCTION}"),
-        ("tracking", None, "NoneType, expected Tracker"),
         ("tracking", Tracker(None, 5), r"int at compile\(\), .* init\(\) and step\(\) and predict\(\)"),
     ],
 )
@@ -159,8 +151,6 @@ def spoilt(name, value, kind=None):
 ODD = [
     ("synchronization", lambda _: (0.0, 100.0), "tuple, expected SyncLock"),
     ("synchronization", but(chip_us=-100.0), r"chip_us = -100\.0, expected a number from 50 to 200"),
-    ("synchronization", but(packet_t_us=-1e15), r"packet_t_us = -1000000000000000\.0, expected"),
-    ("synchronization", but(delay_on_us=math.inf), "delay_on_us = inf, expected"),
     ("synchronization", but(quality=2.0), r"quality = 2\.0, expected a number from 0 to 1"),
     ("separation", lambda _: None, "NoneType, expected PresenceMap"),
     ("separation", but(grid_px=10**6), r"probability of shape \(16, \d+, \d+\), expected \(16, 0, 0\)"),
@@ -170,7 +160,6 @@ ODD = [
     ("separation", but(prior=np.zeros(3)), r"prior of shape \(3,\), expected"),
     ("separation", spoilt("pixels", math.inf), "pixels of other values, expected finite ones"),
     ("separation", spoilt("selected", 1, np.int64), "selected of int64, expected booleans"),
-    ("separation", lambda p: replace(p, pixels=p.pixels[:, 1:]), r"pixels of shape"),
     ("decoding", lambda _: "text", "str, expected SoftSymbols"),
     ("decoding", but(symbols=np.zeros(3, int)), r"symbols of shape \(3,\), expected \(16,\)"),
     ("decoding", spoilt("symbols", -2), "symbol -2, expected 0 to 63, or -1 for one not given"),
@@ -180,11 +169,8 @@ ODD = [
     ("ranging", but(distance_m=0.0), r"distance_m = 0\.0, expected a number above 0 and up to 1e\+15"),
     ("ranging", but(distance_m=10**5000), "distance_m = a int that cannot be shown"),
     ("ranging", but(sigma_m=-1.0), r"sigma_m = -1\.0, expected a number from 0, or NaN"),
-    ("ranging", but(pairs="many"), "pairs = 'many', expected a number"),
-    ("ranging", but(late_chips=math.nan), "late_chips = nan, expected a number"),
     ("ranging", but(bend=3), "int, expected Bend"),
     ("ranging", bent(wave=np.zeros(2)), r"bend.wave of shape \(2,\), expected \(3,\)"),
-    ("ranging", bent(wave_m=math.nan), r"bend.wave_m = nan, expected a number"),
     ("ranging", but(bend=Bend(*np.ones((3, 3, 1)))), r"bend.place of shape \(3, 1\)"),
     ("tracking", lambda found: (found[0] * math.nan, found[1]), r"values \[nan"),
     ("tracking", lambda found: (found[0][:0], found[1]), r"values of shape \(0,\), expected"),
@@ -198,21 +184,6 @@ def test_what_no_next_stage_can_work_with_is_named(role, change, says):
     with pytest.raises(PluginError, match=named) as told:
         received(changed(role, change))
     assert len(str(told.value).splitlines()) == 1
-
-
-@pytest.mark.parametrize(
-    ("role", "change"),
-    [
-        ("synchronization", but(chip_us=np.float32(100.0))),
-        ("separation", but(grid_px=np.int64(2))),
-        ("decoding", lambda soft: replace(soft, symbols=soft.symbols.astype(np.int16))),
-        ("ranging", but(distance_m=math.nan, sigma_m=math.nan, pairs=0)),
-        ("ranging", but(distance_m=np.float64(50.0), sigma_m=math.inf)),
-        ("ranging", but(bend=None)),
-    ],
-)
-def test_other_types_of_right_values_pass(role, change):
-    received(changed(role, change))
 
 
 @pytest.mark.parametrize(
@@ -231,20 +202,3 @@ def test_an_error_correction_that_gives_another_thing_is_named(gives, says):
     for compiled, told in ((compile_code, says), (lambda _: None, "TypeError: gave NoneType at compile")):
         with pytest.raises(PluginError, match=f"^error-correction algorithm 'mine': {told}"):
             received(link_with("error-correction", compiled))
-
-
-def test_hooks_that_exit_end_nothing(demo_raw):
-    class Exits:
-        @hookimpl
-        def evlcp_open_events(self, url):
-            raise SystemExit(0)
-
-        @hookimpl
-        def evlcp_stage_finished(self, stage):
-            raise SystemExit(0)
-
-    registry = Registry.load(Exits())
-    with pytest.raises(PluginError, match=r"^evlcp_stage_finished\(\) of a plugin: SystemExit: 0"):
-        Receiver(LINK, registry.hook).feed(EVENTS)
-    with pytest.warns(PluginWarning, match="evlcp_open_events.* fails: SystemExit: 0"):
-        open_source(demo_raw, registry).close()

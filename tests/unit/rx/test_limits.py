@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from rx_streams import LINK, frames_of, lit, noise_events, steps
+from rx_streams import LINK, lit, noise_events, steps
 
 from evlcp_sdk.clock import Timeline
 from evlcp_sdk.link.sections import RegionSpec
@@ -109,31 +109,6 @@ def test_a_region_that_had_its_time_gives_way():
     assert len(seen) >= 18
     *_, free = stepped(events, 60_000)
     assert len(free.alive) == 18
-
-
-def test_of_many_areas_those_with_the_most_rises_are_looked_at():
-    dim = blobs(8, 5, 40_000)
-    dim = dim[np.random.default_rng(2).random(len(dim)) < 0.6]
-    _, bar = lit(2, x_px=900)
-    *_, regions = stepped(merged(dim, bar[: np.searchsorted(bar.t_us, 40_000)]), 40_000, areas=4)
-    assert regions.counts["areas_left_out"] > 0
-    assert any(abs(one.latest.x_px - 900) < 5 for one in regions.alive)
-
-
-def test_within_the_defaults_nothing_is_left_out():
-    _, bar = lit(3, 1, x_px=700)
-    events = merged(blobs(2, 4, 120_000), bar, noise_events(1.7e6, 120_000))
-    receiver = Receiver(LINK)
-    assert len(frames_of(receiver.feed(events))) >= 10
-    regions = receiver._receivers[0]._regions
-    assert regions._recent
-    receiver.close()
-    assert not regions._recent
-    assert not regions.alive
-    counts = receiver.counts
-    assert counts["events"] == len(events)
-    names = ("dropped_crowded", "steps_forgotten", "dropped_no_room", "regions_left_out", "areas_left_out")
-    assert [counts[name] for name in (*names, "regions_gave_way", "frames_cut")] == [0] * 7
 
 
 def test_the_memory_of_a_receiver_is_bounded():

@@ -318,16 +318,11 @@ def around(north_m, east_m, radius_m):
     ("may", "why"),
     [
         ({"last_id": 6}, "transmitter 7"),
-        ({"last_id": 7}, ""),
         ({"first_id": 7, "last_id": 7}, ""),
-        ({"first_id": 7, "last_id": 9}, ""),
         ({"first_id": 8, "last_id": 9}, "transmitter 7"),
-        (around(0, 0, 1), ""),
         (around(99, 0, 100), ""),
         (around(101, 0, 100), "this place"),
-        (around(70, 70, 100), ""),
         (around(0, 101, 100), "this place"),
-        (around(-99_000, 0, 100_000), ""),
     ],
 )
 def test_a_key_is_for_its_transmitter_ids_and_area(may, why):
@@ -383,14 +378,11 @@ def test_a_revoked_key_signs_nothing():
     [
         ({"height_m": 52.001}, 7, None, "another place than the verified beacon of sequence"),
         ({"heading_deg": 11.0}, 7, None, "another attitude or length than the verified beacon"),
-        ({"tilt_deg": 3.0}, 7, None, "another attitude or length than the verified beacon"),
         ({"length_m": 1.92}, 7, None, "another attitude or length than the verified beacon"),
-        ({}, 9, None, "at the place of transmitter 7, whose beacon is verified; no signature yet"),
         ({"latitude_deg": 35.1 + 0.3 * METRE_DEG}, 9, None, "at the place of transmitter 7"),
         ({"latitude_deg": 35.1 + 0.3 * METRE_DEG}, 9, Operator(), "; signed by a key that is not trusted"),
         ({"latitude_deg": 35.1 + 0.6 * METRE_DEG}, 9, None, ""),
         ({"height_m": 53.0}, 9, None, ""),
-        ({"latitude_deg": 35.2}, 9, None, ""),
         ({"user": b"lane 3"}, 7, None, ""),
     ],
 )

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from evlcp_sdk.air.codebook import hadamard
-from evlcp_sdk.rx.placement import layout_of, lit, masked, placements
-from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid
+from evlcp_sdk.rx.placement import layout_of, masked, placements
+from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.values import PresenceMap
 
 CENTRES = BarLayout().cluster_centres_m()
@@ -89,21 +88,6 @@ def test_a_reflection_beside_stays_out_of_the_footprints():
         assert not (only.selected & ~presence.selected).any()
 
 
-def test_a_halo_is_not_in_the_footprints():
-    """Around a bar four pixels wide, cells show the cluster in their row, or one of any row as often."""
-    rng = np.random.default_rng(1)
-    presence = drawn(CENTRES, (150, 24 + 110j))
-    halo = drawn(CENTRES, (150, 24 + 110j), half_px=12)
-    hit = rng.random(halo.selected.shape[1:]) < 0.4
-    any_row = rng.integers(0, 16, hit.shape) == np.arange(16)[:, None, None]
-    core = presence.selected.any(0)
-    selected = np.where(core, presence.selected, np.where(hit, any_row, halo.selected) & halo.selected.any(0))
-    blurred = map_of(selected)
-    only = masked(blurred, LINE, placements(blurred, LINE)[0])
-    assert (only.informed().probability[presence.selected] > 0.5).all()
-    assert only.informed().probability.sum() < 1.1 * presence.selected.sum()
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_bayes_cell_by_cell(seed):
     rng = np.random.default_rng(seed)
@@ -117,25 +101,6 @@ def test_bayes_cell_by_cell(seed):
     both = likely * prior
     want = both / (both.sum(0) + np.maximum(1 - prior.sum(0), 1e-6))
     np.testing.assert_allclose(presence.informed().probability, want, rtol=2e-3, atol=1e-5)
-
-
-def test_a_hidden_cluster_is_not_lit_by_its_neighbours():
-    """Clusters 5 and 6 are covered; blur carries a fifth of their neighbours' light into their places."""
-    codes = np.concatenate([hadamard(8), -hadamard(8)]).astype(np.int64)
-    whole = drawn(CENTRES, (150, 24 + 110j))
-    rng, light = np.random.default_rng(2), whole.pixels.copy()
-    for k, neighbour in ((5, 4), (6, 7)):
-        light[neighbour] += (rng.random(light.shape[1:]) < 0.2) * light[k]
-        light[k] = 0
-    sums = np.zeros((16, *light.shape[1:]), np.int16)
-    sums[1::2] = 2 * np.einsum("ki,khw->ihw", codes, light)
-    rest = covered(whole, [5, 6])
-    presence = masked(rest, LINE, placements(rest, LINE)[0])
-    only, placement = lit(sums, codes, 2, presence, placements(whole, LINE)[0])
-    assert np.flatnonzero(~placement.seen).tolist() == [5, 6]
-    assert not only.probability[[5, 6]].any()
-    assert not only.selected[[5, 6]].any()
-    assert only.probability[[4, 7]].any((1, 2)).all()
 
 
 def test_few_clusters_are_enough_where_the_scale_is_known():
@@ -167,19 +132,6 @@ def test_a_panel_and_its_mirror_image(conj):
     assert np.abs(found.scale - scale) < 6
     places = found.places(layout)
     assert np.abs(places[1] - places[0]) == pytest.approx(300 * 0.08, rel=0.03)
-
-
-@pytest.mark.parametrize("column", [0, 1])
-def test_one_column_of_two_is_not_taken_for_the_other_in_a_mirror(column):
-    """It looks the same in both; in an image the layout then stands on the other side."""
-    centres = BarLayout(LedColumns(columns=2, apart_m=2.0, rows=48)).cluster_centres_m()
-    rng, found = np.random.default_rng(column), []
-    for _ in range(24):
-        scale = 120 * np.exp(0.01j * rng.normal())
-        shift = complex(24, 60) + complex(*rng.uniform(-1, 1, 2)) - scale * (2 * column - 1)
-        shown = drawn(centres, (scale, shift), size=(48, 120))
-        found += placements(covered(shown, np.arange(8) + 8 - 8 * column), layout_of(centres))[:1]
-    assert [one.mirrored for one in found] == [False] * 24
 
 
 def test_one_cluster_is_where_its_cells_are():

@@ -186,15 +186,6 @@ def test_two_bars_a_few_pixels_apart_are_two(apart_px):
         assert len(frames_of(mine)) >= 28
 
 
-def test_random_blinking_at_the_chip_rate_is_no_transmitter():
-    rng = np.random.default_rng(5)
-    edges = np.diff(rng.integers(0, 2, 1500), prepend=0)[:, None] * np.ones(64 * 4, int)
-    when, pixel = np.nonzero(edges)
-    t = when * 100 + rng.integers(20, 60, len(when))
-    events = merged(Events.of(t, 300 + pixel % 4, 200 + pixel // 4, edges[when, pixel] > 0))
-    assert received(LINK, events)[1] == []
-
-
 def test_a_dark_cluster_costs_only_itself():
     """And the distance is that of the spacing."""
     bar, events = lit(2, cluster_px=9.0)
@@ -266,21 +257,6 @@ STREAM = merged(
     lit(3, 4, x_px=800, start_us=9000, cluster_px=5)[1],
     noise_events(30_000, 130_000),
 )
-
-
-def test_an_attitude_makes_distances_shorter_by_what_the_bar_leans():
-    # These images have no bend, which `joint-scale` would see.
-    poc = load_link(overrides=["ranging.id=poc"])
-    receiver, pitched = received(poc, STREAM, attitude=Attitude(6.0, 0.0))
-    _, level = received(poc, STREAM, attitude=Attitude(0.0, 0.0))
-    assert receiver.counts["frames_askew"] == 0
-    assert receiver.counts["frames"] == 60
-    for a, b in zip(frames_of(pitched), frames_of(level), strict=True):
-        # A pinhole's, of a bar that is seen some rows below the middle of the image.
-        below = (a.y_px - LINK.camera.height / 2) / LINK.camera.focal_px
-        length = np.cos(np.radians(6)) + below * np.sin(np.radians(6))
-        assert a.range.distance_m / b.range.distance_m == pytest.approx(length, abs=1e-4)
-        assert a.range.sigma_m > b.range.sigma_m
 
 
 @pytest.mark.parametrize("t0_us", [-123_457, 16_777_001, 1_700_000_000_123_457])

@@ -5,12 +5,11 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-from rx_streams import LINK, frames_of, lit, received
+from rx_streams import LINK, frames_of, received
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.reflections import FrameDetection, Reflections, repeats
-from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import Events, Frame, Range, SoftSymbols
 
 FORMAT = PacketFormat()
@@ -166,24 +165,6 @@ def test_memory_is_bounded():
         echoes.judge([sighting(k, n, said(n, seed=k), late_us=k) for k in (0, 1, 2 + n // 50)])
         assert sum(map(len, echoes._seen.values())) <= 4 * (3 * FORMAT.frames + 1)
         assert len(echoes._pairs) <= 3 + 2 * 8
-
-
-_, OWN = lit(3, shake_px=2.0)
-
-
-def test_a_rail_shows_the_bar_again():
-    """It is lower than the bar: its image is cut. Nothing else tells events from the same ones."""
-    part = OWN[(OWN.y < 370) & (np.random.default_rng(1).random(len(OWN)) >= 0.4)]
-    receiver, packets = received(LINK, merged(OWN, Events.of(part.t_us + 7, part.x + 80, part.y, part.p)))
-    of_bar, of_rail = ([p for p in packets if (p.frames[0].x_px > 440) == right] for right in (False, True))
-    assert len(frames_of(of_bar)) == len(frames_of(of_rail)) == 30
-    counts = {name: receiver.counts[name] for name in ("packets", "frames", "frames_reflected")}
-    assert counts == {"packets": len(packets), "frames": 60, "frames_reflected": 30}
-    assert all(f.echo_of == p.echo_of for p in packets for f in p.frames)
-    (bar,), (rail,) = ({p.transmitter for p in part} for part in (of_bar, of_rail))
-    assert bar != rail
-    assert {p.echo_of for p in of_bar} == {None}
-    assert {(p.echo_of, p.messages) for p in of_rail} == {(bar, ())}
 
 
 @pytest.mark.parametrize(("share", "farther_m"), [(None, 0.0), (None, 12.0), (0.25, 0.0)])

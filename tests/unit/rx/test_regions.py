@@ -88,17 +88,6 @@ def test_a_bar_that_leaves_the_image_fast_is_let_go(way):
     assert not regions.alive
 
 
-@pytest.mark.parametrize("end", ["top", "bottom"])
-def test_an_end_that_is_dark_for_a_while_is_still_there(end):
-    dark = (BAR_EVENTS.t_us >= 30_000) & (BAR_EVENTS.t_us < 33_000)
-    dark &= BAR_EVENTS.y < 309 if end == "top" else BAR_EVENTS.y >= 411
-    (region,) = followed(BAR_EVENTS[~dark], 60_000)[59_000]
-    for at in region.positions:
-        if at.t_us > 10_000:
-            assert at.y_px == pytest.approx(CENTRE[1], abs=1)
-            assert at.height_px == pytest.approx(128, abs=2)
-
-
 @pytest.mark.parametrize("shows_again", [False, True])
 def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_again):
     """Its lower quarter is hidden, for a while or all the time; one pixel in four above it blinks, too."""
@@ -137,45 +126,12 @@ def test_lamps_and_noise_are_no_regions(hz, duty):
     assert not any(followed(merged(lamp, noise_events(500_000, 60_000)), 60_000).values())
 
 
-@pytest.mark.parametrize("later_us", range(0, STEP_US, 125))
-def test_a_lamp_of_two_chips_is_no_region(later_us):
-    """Wherever in a step its pixels are known as a lamp's, having been candidates in the step before."""
-    lamp = lamp_events(300, 300, 20, 1e6 / (2 * LINK.packet.chip_us), 30_000)
-    lamp = Events.of(lamp.t_us + later_us, lamp.x, lamp.y, lamp.p)
-    assert not any(followed(lamp, 29_000).values())
-
-
 def test_a_moving_edge_is_no_region():
     """A bright post that crosses the image at 3 px/ms: each pixel sees it come and go once."""
     late_us = [0, 20, 40, 3000, 3020, 3040]
     column, row, late_us = np.meshgrid(np.arange(100, 400), np.arange(100, 500), late_us)
     columns = (column - 100) * 333 + late_us, column, row, late_us < 3000
     assert not any(followed(in_order(*map(np.ravel, columns)), 100_000).values())
-
-
-def test_what_a_bar_has_left_is_no_region():
-    """Where a bar was, its veil lets each pixel rise with a chip now and then, not twice within 12 chips."""
-    seen = ideal_events(LINK, replace(BAR, width_px=12))
-    seen = seen[seen.t_us < 30_000]
-    left = np.unique(np.stack([seen.x, seen.y]), axis=1)
-    rng = np.random.default_rng(0)
-    first = 1400 * rng.integers(0, 7, left.shape[1]) + 100 * rng.integers(0, 2, left.shape[1])
-    t = (90_000 + first + 1400 * 7 * np.arange(6)[:, None]).ravel()
-    trail = in_order(t, *np.tile(left, 6), np.ones(t.size))
-    # As many candidates in a step as a region needs, time after time.
-    assert np.bincount((trail.t_us - 90_000) // 1400).min() > 5 * 20
-    by_step = followed(merged(seen, trail), 150_000)
-    assert {region.id for found in by_step.values() for region in found} == {0}
-    assert not by_step[149_000]
-
-
-def test_a_bar_is_found_before_a_panel_of_4_khz():
-    """Its rises come two and a half chips apart: it belongs to no region, and does not widen the bar's."""
-    panel = lamp_events(385, 340, 30, 4000.0, 30_000, duty=0.5)
-    beside = (panel.x < 396) | (panel.x > 406)
-    (region,) = followed(merged(BAR_EVENTS, panel[beside]), 30_000)[29_000]
-    assert region.latest.width_px <= BAR.width_px + 2
-    assert region.latest.height_px == pytest.approx(128, abs=1.5)
 
 
 @pytest.mark.parametrize("jitter_us", [8, 16])
@@ -233,33 +189,6 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events():
     x, y = CENTRE
     assert regions.shape(region, ShownPlace(24_000.0, (x + 0.1, y), (4.0, 128.2))) == 0
     assert regions.shape(region, ShownPlace(24_000.0, (x + 1, y), (4.0, 131.0))) == pytest.approx(3)
-
-
-def test_what_frames_have_shown_to_be_two_stays_two():
-    """A bar over its image, found as one: a jolt brings one region over the other; a pole hides the bar."""
-    below = CENTRE[0], CENTRE[1] + 138
-    image = ideal_events(LINK, replace(BAR, y_px=BAR.y_px + 138), seed=2)
-    hidden = (BAR_EVENTS.t_us >= 30_000) & (BAR_EVENTS.t_us < 50_000)
-    regions = follower(replace(SPEC, fade_us=10_000))
-    for start, _ in stepped(regions, merged(BAR_EVENTS[~hidden], image), 60_000):
-        now = {one.id for one in regions.alive}
-        if start == 10_000:
-            (whole,) = regions.alive
-            assert whole.latest.height_px > 250
-            t_us = whole.latest.t_us
-            regions.shape(whole, ShownPlace(t_us, below, SIZE))
-            beside = regions.beside(whole, t_us, CENTRE, SIZE)
-        elif start == 20_000:
-            whole.positions = Places(replace(p, y_px=p.y_px - 30) for p in whole.positions)
-        elif start == 25_000:
-            # The next frame shows where it is.
-            assert now == {whole.id, beside.id}
-            regions.shape(whole, ShownPlace(whole.latest.t_us, below, SIZE))
-        elif start == 45_000:
-            assert now == {whole.id}
-    # What is seen where it was is no halo: it is found again.
-    assert whole.id in now
-    assert [round(one.latest.y_px) for one in regions.alive] == pytest.approx([488, 350], abs=2)
 
 
 def test_a_region_does_not_go_on_to_the_bar_below():

@@ -14,7 +14,6 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx import workers
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.rx.workers import load_kernels
 from evlcp_sdk.testing.recordings import merged
 
 _, OWN = lit(3, ppm=50, shake_px=6, shake_hz=12)
@@ -97,21 +96,3 @@ def test_what_cannot_be():
     assert multiprocessing.active_children() == before, "a lamp's characters are not shared"
     spots = replace(load_link(overrides=["detection.id=spots", "modulation.id=wh8"]), name="spots")
     Receiver([LINK, spots], workers=2).close()
-
-
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        ["modulation.id=nrz"],
-        ["modulation.id=ppm"],
-        ["bar.shape=ring"],
-        ["bar.rows=24", "bar.columns=2", "bar.led_pitch_m=0.04", "bar.cluster_rows=3"],
-        ["ranging.id=poc", "decoding.id=wh-transform"],
-    ],
-)
-def test_kernels_are_loaded_by_frames_that_are_read(monkeypatch, overrides):
-    """Or else most would be loaded with the first frame of a stream."""
-    read = []
-    monkeypatch.setattr(workers, "_measure_spread", read.append)
-    load_kernels(link := load_link(overrides=overrides))
-    assert read[0].reading.soft.symbols.tolist() == list(range(link.codebook.clusters))
