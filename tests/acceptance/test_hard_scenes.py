@@ -53,15 +53,6 @@ def test_a_fast_drive_that_shakes(distance_m: float, link: tuple[str, ...]) -> N
     assert found.ranged == found.frames_found
 
 
-@pytest.mark.parametrize("link", [DEFAULT, BEST], ids=["default", "best"])
-def test_a_low_sun_behind_the_bar(link: tuple[str, ...]) -> None:
-    found = received("low-sun", (1, 2), ("duration_s=0.15",), link)
-    assert found.frames_found >= 0.95 * found.frames_sent
-    assert found.ber <= 0.001
-    assert found.ranged == found.frames_found
-    assert found.gross == 0
-
-
 def test_motion_feedback_helps() -> None:
     """Motion that is left where regions are not followed well costs bits: half of them and more come back."""
     cut = ("motion.distance_m=90.0", "motion.vib_rate_rad_s=0.24", "duration_s=0.3")

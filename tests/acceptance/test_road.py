@@ -21,7 +21,6 @@ TRUE_WARNINGS = {"bracket-45m": ["clusters-hidden"], "rate-cap-3mev-50m": ["satu
 """What is wrong with two of the recordings; with all others nothing is."""
 
 
-# Figures of benchmarks/road.toml that are not reached, a set a bar; a recording that is not here reaches all.
 def table(*args: str | Path) -> dict[str, Any]:
     """What the benchmark prints as JSON, by recording, of its first link; speed left out."""
     command = [sys.executable, BENCHMARK, *args, "--rounds", "0", "--json"]
