@@ -10,11 +10,9 @@ import pytest
 from evlcp_sdk.io import read_events
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
-    BackgroundSpec,
     BarSpec,
     LampSpec,
     MotionSpec,
-    Scene,
     Simulation,
     load_scene,
     simulation,
@@ -22,7 +20,7 @@ from evlcp_sdk.sim import (
 )
 from evlcp_sdk.values import Events
 from tests.models.truths import scene_of_truth
-from tests.unit.sim.scenes import alike, every, rows, still
+from tests.unit.sim.scenes import every, rows, still
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
 SHORT = replace(load_scene("two-bars"), duration_s=0.03, lamps=(LampSpec(x_m=-1.4, y_m=-0.6, z_m=3.0),))
@@ -49,17 +47,6 @@ def test_the_clock_shifts_all_stamps() -> None:
     assert (np.diff(a.t_us) >= 0).all()
     assert rows(Events(b.t_us - 16_770_000, b.x, b.y, b.p)) == rows(a)
     assert rows(every(SHORT, seed=1)) != rows(a)
-
-
-def test_the_mirrored_scene_is_the_mirrored_recording() -> None:
-    # One column more to the left than to the right of the axis: mirror about it, with an odd width.
-    camera = replace(Scene().camera, width=1279)
-    bar = BarSpec(start_chip=10.0, seed=1)
-    scene = still(0.01, camera=camera, background=BackgroundSpec(texture=0.0))
-    left = every(replace(scene, bars=(bar,)))
-    # The axis meets the image at width / 2 = 639.5, between the columns 639 and 640.
-    right = every(replace(scene, bars=(replace(bar, x_m=-bar.x_m),)))
-    alike(Events(left.t_us, (1279 - left.x).astype(np.uint16), left.y, left.p), right)
 
 
 def test_dark_and_passed_bars_give_nothing() -> None:

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 from scipy.special import j0, j1
 
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.sim import BackgroundSpec, BarSpec, Scene, SensorSpec, Simulation, _kernels
+from evlcp_sdk.sim import BackgroundSpec, BarSpec, Scene, SensorSpec, Simulation, WiperSpec, _kernels
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.optics import blur_of
 from evlcp_sdk.sim.scene import LensSpec
@@ -35,6 +35,9 @@ def image_of_rectangle(
     x = np.minimum(radius, 1)
     aperture = 2 / math.pi * (np.arccos(x) - x * np.sqrt(1 - x**2))
     transfer = aperture * np.exp(-2 * (math.pi * sigma_px) ** 2 * (along**2 + across**2))
+    transfer *= 1 - lens.halo - lens.bloom
+    for share, halo_px in ((lens.halo, lens.halo_px), (lens.bloom, lens.bloom_px)):
+        transfer += share * np.exp(-2 * (math.pi * halo_px) ** 2 * (along**2 + across**2))
     transfer = transfer * np.sinc(along) * np.sinc(across)
     rectangle = length_px * np.sinc(length_px * along) * width_px * np.sinc(width_px * across)
     return np.fft.fftshift(np.fft.ifft2(transfer * rectangle).real) * per_px**2
@@ -58,11 +61,11 @@ def test_the_gaussians_throw_as_much_light_aside_as_the_airy_pattern(f_number: f
 
 
 def test_the_light_on_each_pixel_is_that_of_the_lens(tmp_path: Path) -> None:
-    """A bar that stands still, as its pixels see it, beside the transfer functions of all that blurs it."""
+    """A bar that stands still, dimmed by a wiper, beside the transfer functions of all that blurs it."""
     lit = np.array([1, 0, 0, 1, 1, 0, 0, 0, 1, 0, 1, 1, 0, 0, 0, 1])
     # A last chip of darkness, never sent in this time, says that the bar blinks.
     np.save(tmp_path / "chips.npy", [*[lit] * 99, 0 * lit])
-    lens = LensSpec(halo=0.0)
+    lens = LensSpec(bloom=0.3, bloom_px=6.0)
     scene = Scene(
         duration_s=0.004,
         lens=lens,
@@ -70,6 +73,7 @@ def test_the_light_on_each_pixel_is_that_of_the_lens(tmp_path: Path) -> None:
         background=BackgroundSpec(light_w_m2=0.01, texture=0.0),
         sensor=SensorSpec(noise_hz=0.0, hot_share=0.0),
         bars=(BarSpec(chips_file=str(tmp_path / "chips.npy"), start_chip=10.0),),
+        wiper=WiperSpec(share=0.8, at_s=0.0, lasts_s=0.008, edge_s=0.002),
     )
     simulation = Simulation(scene)
     for _ in simulation.stream():
@@ -82,12 +86,13 @@ def test_the_light_on_each_pixel_is_that_of_the_lens(tmp_path: Path) -> None:
     cluster_px, width_px = (bottom - top) / 16, 0.005 / 50 * CAMERA.focal_px
     image = image_of_rectangle(lens, width_px, cluster_px, lens.blur_px)
     rows, columns = np.arange(round(top) - 8, round(bottom) + 9), np.arange(round(x) - 9, round(x) + 10)
-    expected = np.full((len(rows), len(columns)), 0.01 + scene.sensor.dark_w_m2)
+    expected = np.full((len(rows), len(columns)), 0.01)
     for k in np.flatnonzero(lit):
         along = (rows - (top + (k + 0.5) * cluster_px)) * 8 + 1024
         place_ = np.meshgrid(along, (columns - x) * 8 + 1024, indexing="ij")
         # What is 128 px away and more is not in the image, and not to be seen.
         expected += simulation.bars[0].light_w_m2 * map_coordinates(image, place_, order=3)
+    expected = 0.2 * expected + scene.sensor.dark_w_m2
     seen = light[rows][:, columns]
     active = seen > 0
     assert active.mean() > 0.9

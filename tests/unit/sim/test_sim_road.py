@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
-from scipy.stats import norm
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import resolve
@@ -33,10 +32,9 @@ from evlcp_sdk.sim import (
 from evlcp_sdk.sim.leds import led_light
 from evlcp_sdk.sim.light import BarLight, Source, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
-from evlcp_sdk.sim.optics import blur_of
 from evlcp_sdk.sim.scene import LensSpec
 from evlcp_sdk.values import Events
-from tests.models.pixels import pixel_events, served, words_of
+from tests.models.pixels import served, words_of
 from tests.unit.sim.scenes import EXACT, STILL, alike, every, rows, still
 
 EVEN = BackgroundSpec(light_w_m2=0.3, texture=0.0)
@@ -201,79 +199,6 @@ def test_a_wiper_dims_along_its_line() -> None:
         assert (part[1:] == share[1:][inside]).all()
     once = wiper_switches(replace(wiper, every_s=0.0), 0.0, 3e5)[0]
     assert (once == when[when < 50_000]).all()
-
-
-def lit(z_px: Floats, sigma: float) -> Floats:
-    """Share of a pixel beyond a blurred edge, by quadrature: independent of the simulator's closed form."""
-    nodes, weights = np.polynomial.legendre.leggauss(40)
-    shares = norm.cdf((z_px[..., None] + 0.5 * nodes) / sigma)
-    return shares @ weights * 0.5
-
-
-def light_on(scene: Scene, column: int, row: int) -> tuple[Floats, Floats]:
-    """Light on a pixel of a still scene from each edge on, in W/m2: every image and halo, added up."""
-    simulation = Simulation(scene)
-    end_us = scene.duration_s * 1e6
-    sources = [*(one for bar in simulation.bars for one in (*bar.strips, *bar.images)), *simulation.lamps]
-    switched = [source.switches(0.0, end_us) for source in sources]
-    wiped = wiper_switches(scene.wiper, 0.0, end_us)
-    edges = np.unique(np.concatenate([[0.0], wiped[0], *(when for when, _ in switched)]))
-    total = np.full(len(edges), scene.background.light_w_m2)
-    lens = scene.lens
-    halos = ((lens.halo, lens.halo_px), (lens.bloom, lens.bloom_px))
-    for source, (when, levels) in zip(sources, switched, strict=True):
-        cuts = source.strip.cuts_m()
-        depth = scene.motion.distance_m
-        shift, blur_px = (source.image.shift_px, source.image.blur_px) if source.image else ((0.0, 0.0), 0.0)
-        x = 640 + cuts[:, 0] / depth * FOCAL_PX + shift[0]
-        y = 360 + cuts[:, 1] / depth * FOCAL_PX + shift[1]
-        half = source.strip.width_m / depth * FOCAL_PX / 2
-        blur = blur_of(depth, lens, scene.camera, blur_px)
-        near = (1 - lens.halo - lens.bloom) * blur.share
-        weight = np.zeros(len(cuts) - 1)
-        for share, sigma in (*zip(near, blur.sigma_px, strict=True), *halos):
-            across = lit(column - x[:1] + half, sigma) - lit(column - x[:1] - half, sigma)
-            weight += share * across * np.abs(np.diff(lit(row - y, sigma)))
-        total += source.light_w_m2 * levels[np.searchsorted(when, edges, side="right")] @ weight
-    total *= wiped[1][np.searchsorted(wiped[0], edges, side="right")]
-    return edges, total + scene.sensor.dark_w_m2
-
-
-def test_a_pixel_sees_the_sum_of_all_light() -> None:
-    scene = still(
-        0.02,
-        background=EVEN,
-        bars=(BarSpec(start_chip=5.0, seed=2, covered=(7,), cover_s=((0.0051, 0.0107, 8, 12),)),),
-        lens=LensSpec(bloom=0.3, bloom_px=6.0),
-        reflections=(
-            ReflectionSpec(share=0.5, gap_m=0.05, blur_px=0.9),
-            ReflectionSpec("window", share=0.7, shift_px=(1.4, 3.0)),
-        ),
-        lamps=(LampSpec(-1.5, 0.0, 0.0, 0.3, 0.3, light_w_m2=2.0, flicker_hz=4000.0, duty=0.3),),
-        wiper=WiperSpec(share=0.9, at_s=0.004, lasts_s=0.012, edge_s=0.002),
-    )
-    events = every(scene)
-    centre = round(640 - 1.5 / 50 * FOCAL_PX)
-    last = round(360 + 0.48 / 50 * FOCAL_PX)
-    for column, row in ((centre, 360), (centre + 2, 372), (centre - 1, last), (centre, last + 9)):
-        seen = events[(events.x == column) & (events.y == row)]
-        edges, light = light_on(scene, column, row)
-        want = pixel_events(EXACT, edges, light, scene.duration_s * 1e6)
-        inside = want.request_us < scene.duration_s * 1e6 - 100
-        t_us, on = want.request_us[inside], want.on[inside]
-        if row > last and not len(seen):
-            # No source moves it far enough.
-            continue
-        assert light.max() < 1 or len(t_us) > 100
-        # Light is not followed within 0.1 %: a crossing of a slow slope may move, and one that just touches
-        # the threshold may be missing.
-        assert abs(len(seen) - len(want.on)) <= 0.02 * len(t_us) + 2
-        away = [
-            np.abs(t_us[on == rise] - t - 0.5).min(initial=9e9)
-            for t, rise in zip(seen.t_us, seen.p == 1, strict=True)
-        ]
-        # In the halo, under a wiper, a signal creeps along its threshold for a hundred microseconds.
-        assert light.max() < 1 or np.quantile(away, 0.97) < 6.0
 
 
 def test_a_pothole_strikes_rings_and_decays() -> None:

@@ -12,11 +12,8 @@ from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.plugin.hooks import Algorithm
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.sim import Truth, load_scene, read_truth, resolve_scene, truth_from_table, truth_of
-from evlcp_sdk.study.score import score_frames
 from tests.conftest import Brings
-from tests.unit.mutants import mutants, refusal
 
-SHARED = Path(__file__).parents[4] / "shared" / "recordings"
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 136.9}
 
 
@@ -73,24 +70,6 @@ def test_a_file_without_a_link_is_of_the_default_link() -> None:
         truth_from_table(known)
 
 
-@pytest.mark.skipif(not SHARED.exists(), reason="the recordings of ../shared are not there")
-@pytest.mark.parametrize("path", sorted(SHARED.glob("**/*.truth.json")), ids=lambda path: path.stem)
-def test_files_of_another_generator_are_read(path: Path) -> None:
-    truth, table = read_truth(path), json.loads(path.read_text())
-    assert len(truth.bars) == len(table["bars"])
-    for i, (bar, row) in enumerate(zip(truth.bars, table["bars"], strict=True)):
-        assert bar.link == resolve({"modulation": {"id": row["profile"]}})
-        assert bar.symbols.tolist() == row["symbols"]
-        assert bar.packet.packet_chips == row["packet_chips"]
-        assert bar.distance_m.tolist() == table["distance_m"][i]
-        assert bar.centre_px.T.tolist() == table["bar_centre_px"][i]
-        assert bar.lit == (row["led_w_m2"] is None)
-        assert list(bar.covered) == row.get("covered", [])
-        assert [list(span) for span in bar.cover_s] == row.get("cover_s", [])
-    again = plain(truth)
-    assert {key: again[key] for key in ("scene", "t_s")} == {key: table[key] for key in ("scene", "t_s")}
-
-
 @pytest.mark.parametrize(
     ("path", "value", "says"),
     [
@@ -144,25 +123,3 @@ def test_another_revision_with_the_same_codes_is_a_warning() -> None:
     (warning,) = truth_from_table(table, here, source="t.json").warnings
     assert warning.startswith("t.json: links.")
     assert "(revisions: ranging own 1 there, 2 here); the codes are the same" in warning
-
-
-def test_a_truth_changed_at_any_place_is_a_truth_or_refused_in_one_line(tmp_path: Path) -> None:
-    settings = {"duration_s": 0.05, "bars.cover_s": [[0.0, 0.03, 1, 3]], "bars.pole_s": [[0.02, 0.03]]}
-    world = {f"world.{key}": value for key, value in WORLD.items()}
-    known = plain(truth_of(load_scene("two-bars", settings | world)))
-    registry, lines = Registry.load(), {}
-
-    def read() -> None:
-        truth = read_truth(tmp_path / "t.json", registry)
-        json.dumps(score_frames([], truth), allow_nan=False)
-        truth.to_table()
-
-    for mutant, what in mutants(known, 120, seed=12):
-        (tmp_path / "t.json").write_text(json.dumps(mutant))
-        lines[what] = refusal(read)
-    refused = {what: line for what, line in lines.items() if line is not None}
-    assert 15 < len(refused) < 105
-    for what, line in refused.items():
-        assert line.startswith(f"{tmp_path}/t.json: "), what
-        assert len(line.splitlines()) == 1, what
-        assert len(line) < 600, what
