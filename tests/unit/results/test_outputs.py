@@ -3,8 +3,6 @@
 import hashlib
 import json
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,7 @@ from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
-from tests.conftest import ROOT, rows_of
+from tests.conftest import rows_of
 
 LINK = load_link(overrides=["modulation.id=wh8", "air.frames_per_packet=3", "messages.decode=false"])
 
@@ -169,20 +167,6 @@ def test_the_summary_names_every_file_by_its_digest(tmp_path: Path) -> None:
     (tmp_path / "frames.csv").unlink()
     with pytest.raises(InputError, match=r"frames\.csv: cannot be read"):
         read_frames(tmp_path)
-
-
-def test_parquet_imports_no_pandas(tmp_path: Path) -> None:
-    """Which takes 50 MB, and a second."""
-    pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
-    pytest.importorskip("pandas", reason="pandas is not installed, so that nothing could import it")
-    code = (
-        "import sys; from pathlib import Path; from tests.unit.results.test_outputs import *\n"
-        "result(Path(sys.argv[1]), packet(0, frame(0, 0)), sinks=['parquet'])\n"
-        "print('pyarrow' in sys.modules, 'pandas' in sys.modules)"
-    )
-    command = [sys.executable, "-c", code, tmp_path]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["True", "False"]
 
 
 def test_the_median_needs_no_memory_of_every_frame() -> None:

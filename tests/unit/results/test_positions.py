@@ -16,7 +16,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pynmea2
 import pytest
-from evlcp_formats.foxglove import FRAME_ID
 from PIL import Image
 
 from evlcp_sdk.files import STAGE_PREFIX
@@ -29,7 +28,6 @@ from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.trajectory import trajectory_step
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.report.recording import plot_positions, seconds_since
-from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.geojson import GeoJson
 from evlcp_sdk.results.nmea import Nmea
@@ -53,7 +51,7 @@ from evlcp_sdk.values import (
     SoftSymbols,
     Triggers,
 )
-from tests.conftest import ROOT, rows_of
+from tests.conftest import rows_of
 
 LINK = load_link()
 ZERO = datetime(2026, 3, 1, 10, 15, tzinfo=UTC)
@@ -290,13 +288,7 @@ def test_the_figure_of_a_track() -> None:
     assert (2 * radii.min(), 2 * radii.max()) == pytest.approx(tuple(want), rel=1e-4)
 
 
-def test_a_track_across_the_180th_meridian_is_cut(tmp_path: Path) -> None:
-    metre = 1 / (111_319.5 * math.cos(math.radians(35)))
-    site = dataclasses.replace(SITE, longitude_deg=180 - metre)
-    write(tmp_path, packets(4), PositionPlan((site,)), clock_zero=ZERO)
-    shapes = [shape["geometry"] for shape in features(tmp_path)]
-    (line,) = (shape["coordinates"] for shape in shapes if shape["type"] == "LineString")
-    assert all(-180 <= point[0] < -179.9999 for point in line)
+def test_a_track_across_the_180th_meridian_is_cut() -> None:
     assert cut([]) == [[]]
     for sign in (1.0, -1.0):
         way = [
@@ -454,37 +446,6 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
         heading = math.degrees(math.atan2(forward[0], forward[1])) % 360
         assert abs((heading - float(row["heading_deg"]) + 180) % 360 - 180) < 1e-3
         assert pose.pose.position.z == pytest.approx(float(row["height_m"]) - 54, abs=2e-3)
-
-
-def texts(node: Any) -> list[str]:
-    """All texts in a JSON value, keys too."""
-    if isinstance(node, str):
-        return [node]
-    inside = [*node, *node.values()] if isinstance(node, dict) else node if isinstance(node, list) else []
-    return [text for one in inside for text in texts(one)]
-
-
-def test_the_layout_shows_what_is_written() -> None:
-    """Each panel topics of schemas that Foxglove and its fork Lichtblick can show in it, and all together."""
-    layout = json.loads((ROOT / "examples" / "foxglove-layout.json").read_text())
-    panels, shown = layout["configById"], set()
-    assert set(panels) <= set(texts(layout["layout"]))
-    assert panels["3D!evlcp"]["followTf"] == FRAME_ID
-    can_show = {
-        "Image": {"foxglove.CompressedImage", "foxglove.ImageAnnotations"},
-        "3D": {"foxglove.SceneUpdate", "foxglove.PoseInFrame"},
-        "map": {"foxglove.LocationFix"},
-        "RawMessages": {"google.protobuf.Struct"},
-        "Plot": {"evlcp.Frame"},
-    }
-    for name, panel in panels.items():
-        named = [text.partition("{transmitter==") for text in texts(panel) if text.startswith("/")]
-        assert all(rest == "" or rest.partition("}.")[2] in FRAME_COLUMNS for _, _, rest in named)
-        topics = {topic for topic, _, _ in named}
-        assert {TOPICS[topic] for topic in topics} <= can_show[name.partition("!")[0]]
-        shown |= topics
-    # The map shows all that are places.
-    assert shown | {"/fix"} == set(TOPICS)
 
 
 def test_navsat_is_read_back(tmp_path: Path) -> None:

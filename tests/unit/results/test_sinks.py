@@ -128,10 +128,7 @@ def test_a_format_that_is_not_there(demo_raw: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_the_command_line_asks_for_formats(evlcp: Any, demo_raw: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
-    assert evlcp("receive", demo_raw, "-o", tmp_path, "--sink", "parquet").code == 0
-    assert (tmp_path / "frames.parquet").exists()
+def test_a_format_of_positions_needs_sites(evlcp: Any, demo_raw: Path, tmp_path: Path) -> None:
     done = evlcp("receive", demo_raw, "-o", tmp_path / "out", "--sink", "mcap")
     assert (done.code, done.err) == (2, "evlcp: sink 'mcap' needs --sites: it writes positions\n")
     assert not (tmp_path / "out").exists()
