@@ -168,22 +168,6 @@ def test_the_fit_is_that_of_scipy() -> None:
     np.testing.assert_allclose(fit.local.ravel(), scipy.x[13:], atol=0.03)
 
 
-def test_a_step_turns_about_the_bars() -> None:
-    """To first order along the straight line; a turn alone keeps the camera as far from the bars."""
-    p, position, rotation = problem(np.random.default_rng(4))
-    at = Fit.at(p, position, rotation)
-    centre = p.points[:, :3].mean(0)
-    turn = np.array([0.0, 0.0, 0.3])
-    step = np.zeros(14)
-    step[:3], step[3:6] = np.cross(turn, position - centre), turn
-    equations = linearize(p, at)
-    there = equations.moved(step)
-    assert np.linalg.norm(there.position - centre) == pytest.approx(np.linalg.norm(position - centre))
-    np.testing.assert_allclose(there.rotation, Rotation.from_rotvec(turn).as_matrix() @ rotation, atol=1e-12)
-    small = equations.moved(1e-6 * step)
-    np.testing.assert_allclose(small.position - position, 1e-6 * step[:3], atol=1e-10)
-
-
 @pytest.mark.parametrize("bound", [0.0, 0.3])
 def test_a_mean_shift_test_is_the_larger_fit(bound: float) -> None:
     """A linear problem with the fault's parameters as unknowns beside the others, solved whole."""
@@ -264,26 +248,6 @@ def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
     together = pose.noise + pose.slow + sum(m @ m.T for m in pose.standing.values())
     np.testing.assert_allclose(together, spread[:3, :3], rtol=1e-6, atol=1e-9)
     assert abs(np.linalg.eigh(spread[:3, :3])[1][:, -1] @ pose.along) == pytest.approx(1)
-
-
-def test_protection_levels_hold_with_any_bar_at_fault() -> None:
-    """The widest of what a bar that stands anywhere may hide, each told by its own test."""
-    p, position, rotation = problem(np.random.default_rng(12), 3, noise=1.0)
-    p = dataclasses.replace(p, spec=dataclasses.replace(p.spec, bar_fault_m=0.0))
-    fit = fitted(p, position, rotation)
-    found, spread = assess_fit(fit), fit.spread
-    assert isinstance(found, Pose)
-    risk = stats.chi2.isf(SPEC.risk, 1)
-    for b in range(3):
-        bars = fit.bars
-        column = bars.info[b, :, :6] * p.free[:, None]
-        own, side = bars.info[b, :6, :6], bars.right[b, :6]
-        value, freedom, added, unseen = _test(own, column, side, spread, np.zeros((6, 6)))
-        assert value == pytest.approx(found.tests[f"bar {b}"])
-        hidden = np.sqrt(stats.chi2.isf(SPEC.false_alarm / 2 / len(found.tests), freedom) * np.diag(unseen))
-        assert (found.hidden_m >= hidden * (1 - 1e-9)).all()
-        height_m = hidden[2] + math.sqrt(risk * (spread[2, 2] + added[2, 2]))
-        assert found.vpl_m >= height_m * (1 - 1e-9)
 
 
 @pytest.mark.parametrize("off", [0.0, 2.0, 6.0])

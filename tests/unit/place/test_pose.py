@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from scipy import stats
-from scipy.optimize import approx_fprime, least_squares
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
@@ -111,22 +111,6 @@ def test_attitude_is_the_named_turns(heading: float, pitch: float, roll: float) 
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_slopes_are_the_numerical_ones(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    rotation = Attitude(*rng.uniform(-30, 30, 2), rng.uniform(0, 360)).rotation()
-    position = rng.uniform(-100, 100, 3)
-    enu = position + rotation @ np.array([rng.uniform(-2, 2), rng.uniform(-1, 1), rng.uniform(20, 60)])
-
-    def image(unknown: Floats) -> Floats:
-        turned = Rotation.from_rotvec(unknown[3:]).as_matrix() @ rotation
-        return project_bars(enu[None], position + unknown[:3], turned, BENT)[0][0]
-
-    _, slope = project_bars(enu[None], position, rotation, BENT)
-    want = approx_fprime(np.zeros(6), image, 1e-6)
-    np.testing.assert_allclose(slope[0], want, rtol=1e-5, atol=2e-2)
-
-
-@given(st.integers(0, 2**32 - 1))
 def test_three_points_give_their_pose_among_the_solutions(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rotation = Rotation.random(random_state=rng).as_matrix()
@@ -144,30 +128,6 @@ def test_three_points_give_their_pose_among_the_solutions(seed: int) -> None:
         assert np.linalg.det(best) == pytest.approx(1)
 
 
-@pytest.mark.parametrize("camera", [CAMERA, BENT])
-@pytest.mark.parametrize(
-    ("places", "known"),
-    [
-        (THREE[:1], Attitude(4.0, -2.0, 123.0, 0.1, 0.1)),
-        (THREE[:1], Attitude(4.0, -2.0, 123.0, 0.0, 0.0)),
-        (THREE[:2], Attitude(4.0, -2.0, None, 0.0)),
-        (THREE[:2], Attitude(4.0, -2.0, None, 0.01)),
-        (THREE, Attitude(4.0, -2.0, None, 0.2)),
-        (THREE, None),
-    ],
-)
-def test_without_noise_the_pose_is_exact(camera, places, known) -> None:
-    # The whole scene is turned to the heading of 123 degrees and moved.
-    rotation = Attitude(4.0, -2.0, 123.0).rotation()
-    turn = Rotation.from_euler("z", -123, degrees=True).as_matrix()
-    position = np.array([310.0, -95.0, 12.0])
-    bars = [position + (bar(p, (0.05, 0.02, 1.0))) @ turn.T for p in places]
-    pose = solved(solve_pose(views(bars, position, rotation, camera=camera), camera, known))
-    np.testing.assert_allclose(pose.enu_m, position, atol=1e-3)
-    np.testing.assert_allclose(pose.rotation, rotation, atol=2e-5)
-    assert pose.transmitters == tuple(range(len(places)))
-
-
 ALL = {"survey": SURVEY, "focal": 0.005, "across": 0.5}
 SHIFTED = {"spec": replace(POINTS_ONLY, shared_sigma_px=0.1, shared_along_px=0.1)}
 SHAKEN = {"spec": replace(POINTS_ONLY, shaken_sigma_px=0.5)}
@@ -182,9 +142,7 @@ POINTS = {"spec": POINTS_ONLY, "noise_px": 0.3}
     [
         # At 50 m, with the largest error of nineteen in twenty.
         (POLES, LEVEL, POINTS, 0.15),
-        (THREE, LEVEL, POINTS, 0.03),
         (THREE, None, POINTS, 0.03),
-        (POLES[:1], Attitude(5.0, 0.0, 0.0, 0.0, 0.1), POINTS, 0.35),
         (POLES[:1], COMPASS, POINTS, 0.35),
         *((places, known, ALL, math.inf) for places, known in (
             (POLES[:1], COMPASS), (POLES[:1], LATE), (POLES, COMPASS), (POLES, GRAVITY), (THREE, GRAVITY),
@@ -196,9 +154,7 @@ POINTS = {"spec": POINTS_ONLY, "noise_px": 0.3}
         # What all bars share is an error of an exact attitude.
         (POLES[:1], EXACT, SHAKEN, math.inf),
         (POLES, LEVEL, SHAKEN, math.inf),
-        (POLES, EXACT, SHAKEN, math.inf),
         # A compass of half a degree: 0.44 m at 50 m, along an arc 8 mm off its tangent.
-        (POLES[:1], Attitude(5.0, 0.0, 0.0, 0.0, 0.5), SHIFTED, math.inf),
         (POLES[:1], Attitude(5.0, 0.0, 0.0, 0.1, 0.5), SHIFTED, math.inf),
     ],
 )  # fmt: skip

@@ -314,16 +314,9 @@ def test_an_attitude_file(tmp_path: Path) -> None:
     assert (found.pitch_deg, found.roll_deg, found.heading_deg) == pytest.approx((2, -1, 0))
     assert (found.gravity_sigma_deg, found.heading_sigma_deg) == pytest.approx((0.7, 0.3))
     assert track.at(1001) is None
-    head = "t_us,pitch_deg,roll_deg\n"
-    for fault, message in (
-        ("t_us,roll_deg\n0,1\n", "line 1: no column pitch_deg"),
-        (f"{head}0,1,2\n", "two lines or more with rising t_us"),
-        (f"{head}0,1,2\n\n5,1,2\n3,1,2\n", r"line 5: t_us = 3: expected more than .* 5"),
-        ("t_us,pitch_deg,roll_deg,gravity_sigma_deg\n0,1,2,1\n1,1,2,-1\n", "line 3: gravity_sigma_deg = '-"),
-    ):
-        path.write_text(fault)
-        with pytest.raises(ConfigError, match=message):
-            AttitudeLog.read(path)
+    path.write_text("t_us,pitch_deg,roll_deg\n0,1,2\n")
+    with pytest.raises(ConfigError, match="two lines or more with rising t_us"):
+        AttitudeLog.read(path)
 
 
 def test_poses_that_are_left_open_are_told_on_earth() -> None:

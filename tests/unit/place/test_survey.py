@@ -1,4 +1,4 @@
-"""A survey: bars come back within their sigmas, by poses that are all off alike, or of a track of its own."""
+"""A survey: bars come back within their sigmas, by poses that are all off alike."""
 
 import dataclasses
 import math
@@ -9,18 +9,14 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.place.calibration import CalibrationView, KnownPose
+from evlcp_sdk.place.calibration import CalibrationView
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.gnss import GnssLog
-from evlcp_sdk.place.navigator import Navigator, PositionPlan
 from evlcp_sdk.place.observations import BarView, project_bars
-from evlcp_sdk.place.survey import OwnPoses, survey
+from evlcp_sdk.place.survey import survey
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Packet
-from tests.unit.place.place_scenes import POINTS_ONLY, Floats, frame, square
+from tests.unit.place.place_scenes import POINTS_ONLY, square
 
 AXES = LocalAxes(35.0, 137.0, 50.0)
 CAMERA = CameraModel(focal_mm=16.0)
@@ -106,101 +102,3 @@ def test_what_cannot_be_surveyed_is_told() -> None:
     wrong = dataclasses.replace(seen[3], enu_m=seen[3].enu_m + np.array([3.0, 0.0, 0.0]))
     with pytest.raises(ConfigError, match="miss one another"):
         survey([*seen[:3], wrong, *seen[4:]], AXES, 0.96, CAMERA, spec=SPEC)
-
-
-LINK = load_link()
-PACKET_US = LINK.packet.packet_chips * LINK.packet.chip_us
-TRUE = Attitude(2.0, 0.5, 3.0)
-BIAS_DEG, SITE_M = 0.1, 0.02
-SPOTS = {0: (-4.0, 60.0, 3.0), 1: (4.0, 66.0, 4.0), 2: (1.0, 75.0, 5.0)}
-
-
-def site_of(number: int, off: Floats | None = None) -> BarSite:
-    place = AXES.to_geodetic(np.array(SPOTS[number]) + (0.0 if off is None else off))
-    return BarSite(number, *map(float, place), transmitter=number, position_sigma_m=SITE_M)
-
-
-def where(t_us: float) -> Floats:
-    return np.array([0.5, 10e-6 * t_us, 0.0])
-
-
-def shown(number: int, t_us: float) -> Floats:
-    enu = site_of(number).cluster_positions_m(16, AXES)
-    return project_bars(enu, where(t_us), TRUE.rotation(), LINK.camera)[0]
-
-
-def packets(rng: np.random.Generator, first: int = 15, last: int = 45) -> list[Packet]:
-    """Two known bars all the time, a new one for a second in the middle."""
-    found = []
-    for n in range(60):
-        for number in SPOTS:
-            if number == 2 and not first <= n < last:
-                continue
-            frames = []
-            for k in range(3):
-                t_us = n * PACKET_US + 2600 + k * 11_000
-                points = shown(number, t_us) + rng.normal(0, 0.07, (16, 2)) + rng.normal(0, 0.05, 2)
-                frames.append(frame(points, 0.0707, t_us, number, n, k))
-            found.append(Packet(number, n, n * PACKET_US, 100.0, tuple(frames), 10))
-    return found
-
-
-def poses_of(stream: list[Packet], plan: PositionPlan, told: Attitude) -> list[KnownPose]:
-    own = OwnPoses(Navigator(LINK, plan, told), lambda _t: told, "rec.raw")
-    for packet in stream:
-        own.take(packet)
-    return own.close()
-
-
-def own_poses(rng: np.random.Generator, stream: list[Packet]) -> list[KnownPose]:
-    bias = BIAS_DEG * rng.normal(size=3)
-    told = Attitude(2.0 + bias[0], 0.5 + bias[1], 3.0 + bias[2], BIAS_DEG, BIAS_DEG)
-    sites = tuple(site_of(n, SITE_M * rng.normal(size=3)) for n in (0, 1))
-    return poses_of(stream, PositionPlan(sites), told)
-
-
-def test_a_new_bar_is_surveyed_within_its_sigmas() -> None:
-    rng, squares, off = np.random.default_rng(3), [], []
-    for _ in range(3):
-        stream = packets(rng)
-        poses = own_poses(rng, stream)
-        assert 8 < len(poses) <= 12
-        assert all(14.5 * PACKET_US < pose.t_us < 45.5 * PACKET_US for pose in poses)
-        views = []
-        # A few of them: the survey itself is slow.
-        for pose in poses[::3]:
-            here = AXES.to_enu(pose.latitude_deg, pose.longitude_deg, pose.height_m)
-            off.append(np.linalg.norm(here - where(pose.t_us)) / pose.position_sigma_m)
-            points = shown(2, pose.t_us) + rng.normal(0, 0.07, (16, 2))
-            seen = (BarView(2, np.empty((0, 3)), points, np.full(16, 0.0707)),)
-            sigmas = (pose.position_sigma_m, pose.attitude.rotation(), pose.attitude_sigma_deg)
-            views.append(CalibrationView(seen, here, *sigmas))
-        (bar,) = survey(views, AXES, 0.96, LINK.camera)
-        place = AXES.to_enu(bar.site.latitude_deg, bar.site.longitude_deg, bar.site.height_m)
-        squares.append(square(place - SPOTS[2], bar.covariance_m2))
-        assert np.linalg.norm(place - SPOTS[2]) < 0.4
-    # Errors of place and of attitude, which belong together, count one by one: never too sure.
-    assert sum(squares) < stats.chi2.isf(1e-3, 9)
-    assert max(off) < 4
-
-
-def test_without_new_bars_there_are_no_poses() -> None:
-    rng = np.random.default_rng(4)
-    assert own_poses(rng, [p for p in packets(rng) if p.transmitter != 2]) == []
-
-
-def test_satellites_and_a_compass_do_without_known_bars() -> None:
-    """A new bar behind the last known one: places by satellites, angles by the log."""
-    rng = np.random.default_rng(5)
-    stream = [p for p in packets(rng, 40, 60) if p.transmitter == 2 or p.packet < 30]
-    t_us = np.arange(20) * 1e5
-    place = np.stack(AXES.to_geodetic(np.array([where(t) for t in t_us])), 1)
-    log = GnssLog(t_us, place, np.tile(0.01 * np.eye(3), (20, 1, 1)))
-    told = Attitude(2.0, 0.5, 3.0, 0.2, 0.3)
-    poses = poses_of(stream, PositionPlan((site_of(0), site_of(1)), log), told)
-    assert len(poses) >= 4
-    for pose in poses:
-        assert pose.t_us in t_us
-        assert pose.attitude is told
-        assert pose.attitude_sigma_deg == pytest.approx(0.3)
-        assert pose.position_sigma_m < 0.2
