@@ -1,4 +1,4 @@
-"""Variants of the receiver on recordings with truth by another generator; the default link is `test_road`'s."""
+"""Variants of the receiver on recordings with truth by another generator; `test_road` has the default one."""
 
 from functools import cache
 from pathlib import Path
