@@ -122,16 +122,6 @@ def test_bars_of_two_links_give_one_fix() -> None:
     assert {fix.refusal for fix in alone} == {"no-site"}
 
 
-def test_a_site_of_another_link_is_none() -> None:
-    told = dataclasses.replace(LEFT, link="beacon", transmitter=None)
-    packets = packets_of(LEFT, 0, 4, messages={0: (heard(LEFT, "unverified", 0),)})
-    fixes = fixes_of(positioner([told], link="bar"), packets)
-    assert {fix.refusal for fix in fixes} == {"no-site"}
-    assert fixes[0].detail == "no site is known of transmitter 0 (id 7)"
-    for link in ("", "beacon"):
-        assert_right(fixes_of(positioner([told], link=link), packets))
-
-
 def test_one_bar_gives_a_fix_a_packet_time() -> None:
     unknown = positioner([LEFT])
     fixes = fixes_of(unknown, packets_of(RIGHT, 3, 4))

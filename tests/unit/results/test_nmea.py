@@ -7,7 +7,6 @@ import pynmea2
 import pytest
 from hypothesis import given, strategies as st
 
-from evlcp_sdk.place.gnss import checksum
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.results.gpsd import answer, sky, tpv
 from evlcp_sdk.results.nmea import clock_of, gga, rmc
@@ -54,11 +53,6 @@ def test_no_fix_says_so() -> None:
     still = pynmea2.parse(rmc(begun, (0.0, 0.0, 0.0), None).strip(), check=True)
     assert still.is_valid
     assert still.spd_over_grnd is None
-
-
-def test_the_standards_own_sum() -> None:
-    # The example that the standard's readers quote.
-    assert checksum("GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,") == "47"
 
 
 def test_sixty_minutes_carry() -> None:

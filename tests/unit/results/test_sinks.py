@@ -1,6 +1,5 @@
-"""Sinks: a format is one file and one hook; what fails is named, and leaves nothing."""
+"""Sinks: what fails is named, and leaves nothing; `examples/third_party_formats` has one that does not."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,10 +14,8 @@ from evlcp_sdk.plugin.records import installed_sinks
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.run import receive, receive_to_folder
+from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.values import Packet
-from tests.conftest import rows_of
-from tests.unit.results import distances
 from tests.unit.results.test_outputs import result
 from tests.unit.results.test_positions import packets
 
@@ -32,27 +29,6 @@ def test_the_built_in_formats_come_by_the_same_hook() -> None:
     for sink in sinks.values():
         if sink.distribution == "evlcp-sdk":
             assert issubclass(sink.load_class(), Sink)
-
-
-def test_a_format_is_one_file_and_one_hook(demo_raw: Path, tmp_path: Path) -> None:
-    registry = Registry.load(distances)
-    table = receive_to_folder(demo_raw, tmp_path, registry=registry, sinks=["distances"])
-    rows = [row for row in rows_of(tmp_path / "frames.csv") if row["distance_m"]]
-    lines = (tmp_path / "distances.line").read_text().splitlines()
-    found = [line.split() for line in lines]
-    assert [value for _, value, _ in found] == [f"depth_m={row['distance_m']}" for row in rows]
-    assert [float(t_ns) * 1e-3 for _, _, t_ns in found] == pytest.approx(
-        [float(row["t_us"]) for row in rows], abs=0.006
-    )
-    assert table["sinks"] == {"distances": {"lines": len(rows), "frames_watched": len(rows)}}
-    assert json.loads((tmp_path / "summary.json").read_text()) == table
-    # Asked no more, it is dropped with the rest of the earlier result; the same is counted.
-    reception = receive(demo_raw)
-    list(reception)
-    table = receive_to_folder(demo_raw, tmp_path, registry=registry)
-    assert table["counts"] == reception.counts
-    assert "sinks" not in table
-    assert {p.name for p in tmp_path.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
 
 
 def opens(*names: str) -> Callable[..., None]:
