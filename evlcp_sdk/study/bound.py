@@ -3,15 +3,12 @@
 They belong to the geometry of the problem and to no algorithm, so they stand here and not beside one: how
 sharply light shows in the image, how noisy its pixels are, and how far clusters lie apart bound whatever
 reads it. Pixels have Gaussian noise of one size (Kay, Estimation Theory, chapter 3). Of a bar, one even
-column of clusters, it is the boundaries between clusters that say where they lie; `layout_bound` takes any
-layout, by the light of each cluster, in two dimensions.
+column of clusters, it is the boundaries between clusters that say where they lie.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +19,6 @@ from scipy.stats import theilslopes
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.values import FrameView, PresenceMap, Range
 
 Array = NDArray[np.float64]
@@ -56,16 +52,6 @@ _LEAST_FREE = 0.1
 
 _LEAST_BOUNDARIES = 3
 """Boundaries without which spacing, position and drift cannot be separated."""
-
-_POSE = ("x_px", "y_px", "scale", "turn")
-_LENS = ("gain", "dark", "blur", "drift_x", "drift_y")
-_LEAN = ("lean", "swing")
-
-_STEP = 1e-4
-"""Of the differences that give slopes, px, radians and shares: their errors are its square."""
-
-_SEAM_SIGMAS = 4.0
-"""How far around its LEDs an image shows a layout, in blurs; and 2 px beside."""
 
 
 def bar_bound(
@@ -107,9 +93,7 @@ def bar_bound(
     _check_positive(distance_m=distance_m, blur_px=blur_px, noise=noise)
     spacing_m = link.bar.column_pitch_m
     if not spacing_m > 0:
-        raise ConfigError(
-            "this Cramer-Rao bound needs one even column of two clusters or more; layout_bound takes any"
-        )
+        raise ConfigError("this Cramer-Rao bound needs one even column of two clusters or more")
     spacing = link.camera.focal_px * spacing_m / distance_m
     codes = _codes(link.codebook, np.asarray(symbols, np.int64))
     clusters, values = codes.shape
@@ -364,147 +348,3 @@ def _line(light: NDArray[np.float32]) -> tuple[float, float]:
     middle = (weight * row).sum() / total
     slope = (weight * (row - middle) * column).sum() / (weight * (row - middle) ** 2).sum()
     return float(slope), float((weight * column).sum() / total - slope * middle)
-
-
-@dataclass(frozen=True)
-class LayoutBound:
-    """Smallest standard deviations of what one frame shows; infinite where it shows nothing.
-
-    Attributes:
-        x_px, y_px: Of the layout's place in the image, to the right and downward.
-        distance_m: Of its distance.
-        turn_deg: Of its turn in the image.
-        lean_deg: Of a lean of its top towards the camera or from it, of a layout that hardly leans.
-        swing_deg: The same of its left side.
-    """
-
-    x_px: float
-    y_px: float
-    distance_m: float
-    turn_deg: float
-    lean_deg: float
-    swing_deg: float
-
-
-def layout_bound(
-    link: Link,
-    distance_m: float,
-    symbols: ArrayLike,
-    *,
-    blur_px: float,
-    noise: float,
-    gain: float = 0.8,
-    dark: float = 0.1,
-    shift_px: tuple[float, float] = (0.0, 0.0),
-    turn_deg: float = 0.0,
-) -> LayoutBound:
-    """Bounds of one frame of a layout seen from the front.
-
-    Place, scale, turn, gain, background, blur and the drift within the frame are unknown together; for lean
-    and swing, these too.
-
-    Args:
-        link: For the camera, the layout and its codes.
-        distance_m: Its distance, m.
-        symbols: The frame's, integers (K,).
-        blur_px: Sigma of a point in the image, px.
-        noise: Standard deviation of one pixel's value, in full values.
-        gain: Share of a full value that is seen.
-        dark: The background's light, as a share of that of a pixel that an LED fills.
-        shift_px: Where the layout's centre lies from a pixel's middle, right and down, px.
-        turn_deg: Its turn in the image, clockwise.
-
-    Raises:
-        ConfigError: A quantity that must be positive is not.
-
-    >>> from evlcp_sdk.link.resolve import load_link
-    >>> link = load_link(overrides=["bar.shape=ring"])
-    >>> bound = layout_bound(link, 50.0, range(12), blur_px=0.45, noise=0.3)
-    >>> round(bound.distance_m, 3), round(bound.lean_deg, 1)
-    (0.031, 13.6)
-    """
-    _check_positive(distance_m=distance_m, blur_px=blur_px, noise=noise, gain=gain, dark=dark)
-    scale = link.camera.focal_px / distance_m
-    codes = _codes(link.codebook, np.asarray(symbols, np.int64))
-    image = _Image.around(link.bar, scale, blur_px, codes, distance_m)
-    fit = {
-        "x_px": shift_px[0],
-        "y_px": shift_px[1],
-        "scale": math.log(scale),
-        "turn": math.radians(turn_deg),
-        "gain": gain,
-        "dark": math.log(dark),
-        "blur": math.log(blur_px),
-    }
-    slopes = np.stack([image.slope(fit, name) for name in (*_POSE, *_LENS, *_LEAN)])
-    information = slopes @ slopes.T / noise**2
-    flat = _sigmas(information[: len(_POSE + _LENS), : len(_POSE + _LENS)])
-    leaning = _sigmas(information)
-    x_px, y_px, share, turn = flat[:4].tolist()
-    lean, swing = np.degrees(leaning[-2:]).tolist()
-    return LayoutBound(x_px, y_px, distance_m * share, math.degrees(turn), lean, swing)
-
-
-@dataclass(frozen=True, eq=False)
-class _Image:
-    """What makes the values of a frame of its parameters.
-
-    Attributes:
-        leds_m: The LEDs, m, float64 (n, 3).
-        first: Of the LEDs in the order of their clusters, where each cluster starts, int64 (K + 1,).
-        side_m: Width and height that one lights, m.
-        codes: What each cluster sends, float64 (K, values).
-        grid: Columns of the pixels, and rows, from the middle of the image, px, float64 (n,).
-        distance_m: For the perspective of what stands out or leans.
-    """
-
-    leds_m: Array
-    first: NDArray[np.int64]
-    side_m: float
-    codes: Array
-    grid: Array
-    distance_m: float
-
-    @classmethod
-    def around(
-        cls, bar: BarLayout, scale: float, blur_px: float, codes: Array, distance_m: float
-    ) -> "_Image":
-        seam = _SEAM_SIGMAS * blur_px + 2 + bar.shape.led_m * scale
-        half = math.ceil(scale * float(np.abs(bar.led_positions_m()[:, :2]).max()) + seam)
-        grid = np.arange(-half, half + 1, dtype=np.float64)
-        which = bar.led_clusters()
-        order = np.argsort(which, kind="stable")
-        first = np.searchsorted(which[order], np.arange(bar.clusters + 1))
-        return cls(bar.led_positions_m()[order], first, bar.shape.led_m, codes, grid, distance_m)
-
-    def values(self, fit: dict[str, float]) -> Array:
-        """Expected values, float64 (values, pixels)."""
-        x, y, z = self.leds_m.T
-        # To first order, what leans stands out by so much.
-        z = z + y * fit.get("lean", 0.0) + x * fit.get("swing", 0.0)
-        scale = math.exp(fit["scale"])
-        near = scale / (1 - z / self.distance_m)
-        turn, side, blur = fit["turn"], scale * self.side_m, math.exp(fit["blur"])
-        c, s = math.cos(turn), math.sin(turn)
-        u = fit["x_px"] + near * (c * x - s * y)
-        v = fit["y_px"] + near * (s * x + c * y)
-        beside = (self.grid - at[:, None] for at in (u, v))
-        across, down = (ndtr((away + side / 2) / blur) - ndtr((away - side / 2) / blur) for away in beside)
-        parts = [slice(a, b) for a, b in pairwise(self.first)]
-        light = np.stack([(down[part].T @ across[part]).ravel() for part in parts])
-        seen: Array = fit["gain"] * (self.codes.T @ (light / (light.sum(0) + math.exp(fit["dark"]))))
-        return seen
-
-    def slope(self, fit: dict[str, float], name: str) -> Array:
-        """How the values change with a parameter, float64 (values * pixels,)."""
-        step = _STEP
-        if name.startswith("drift"):
-            axis = name.replace("drift_", "") + "_px"
-            values = len(self.codes[0])
-            when = _times(values)
-            return (self.slope(fit, axis).reshape(values, -1) * when[:, None]).ravel()
-        if name in _LEAN:
-            # A lean shows by its perspective, which is weak.
-            step *= self.distance_m
-        low, high = ({**fit, name: fit.get(name, 0.0) + by} for by in (-step, step))
-        return ((self.values(high) - self.values(low)) / (2 * step)).ravel()

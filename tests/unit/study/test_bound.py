@@ -1,23 +1,18 @@
 """The Cramer-Rao bounds: their laws, closed forms, and statistics from frames that follow the models."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 from scipy.stats import norm
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.scene.bar import BarLayout, LedTable
-from evlcp_sdk.study.bound import _Image, bar_bound, frame_bound, layout_bound
+from evlcp_sdk.study.bound import bar_bound, frame_bound
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 LINK = load_link()
 K, COLUMNS, FULL = 16, 4, 300.0
-RING_BAR = ["bar.shape=ring", "bar.leds=12", "bar.radius_m=0.25"]
-RING, SMALL = load_link(overrides=RING_BAR), load_link(overrides=[*RING_BAR, "bar.led_m=0.001"])
 
 
 def bound(**how: float) -> float:
@@ -34,8 +29,6 @@ def test_the_bound_follows_noise_and_distance() -> None:
         given: dict[str, float] = {"distance_m": 50.0, "blur_px": 0.4, "noise": 0.1, name: -1}
         with pytest.raises(ConfigError, match=f"{name} = -1"):
             bar_bound(LINK, symbols=range(K), **given)
-        with pytest.raises(ConfigError, match=f"{name} = -1"):
-            layout_bound(RING, symbols=range(12), **given)
 
 
 @pytest.mark.parametrize("blur_px", [0.6, 0.9])
@@ -146,72 +139,8 @@ def test_other_layouts_than_one_even_column_have_none() -> None:
     panel = load_link(
         overrides=["bar.rows=16", "bar.columns=16", "bar.cluster_rows=4", "bar.cluster_columns=4"]
     )
-    with pytest.raises(ConfigError, match="layout_bound takes any"):
+    with pytest.raises(ConfigError, match="one even column of two"):
         bar_bound(panel, 50.0, range(16), blur_px=0.4, noise=0.1)
     for link in (panel, load_link(overrides=["bar.rows=12"])):
         with pytest.raises(ConfigError, match="needs one even column of three"):
             frame_bound(link)
-
-
-# Light far below the background's, so that values follow it in proportion, and LEDs far smaller than the
-# blur, which covers pixels: sums over pixels are then integrals of Gaussians.
-FAINT, BLUR_PX, NOISE = 1e3, 1.5, 1e-4
-VALUES = RING.codebook.pilot_edges.shape[1] + RING.codebook.codeword_edges.shape[1]
-
-
-@pytest.mark.parametrize("distance_m", [30.0, 50.0])
-def test_a_ring_of_faint_leds_has_the_closed_form(distance_m: float) -> None:
-    px_per_m = RING.camera.focal_px / distance_m
-    # Of the place of one small, blurred, faint LED along an axis: values pi / 2 (peak / noise)^2.
-    peak = 0.8 / FAINT * (0.001 * px_per_m) ** 2 / (2 * math.pi * BLUR_PX**2)
-    each = VALUES * math.pi / 2 * (peak / NOISE) ** 2
-    found = layout_bound(SMALL, distance_m, range(12), blur_px=BLUR_PX, noise=NOISE, dark=FAINT)
-    radius_px, radius_m = 0.25 * px_per_m, 0.25
-    together = math.sqrt(12 * each)
-    assert found.x_px == pytest.approx(1 / together, rel=0.02)
-    assert found.y_px == pytest.approx(1 / together, rel=0.02)
-    assert found.distance_m == pytest.approx(distance_m / (radius_px * together), rel=0.02)
-    assert math.radians(found.turn_deg) == pytest.approx(1 / (radius_px * together), rel=0.02)
-    # A lean moves an LED outward by radius_px * radius_m / distance_m times the sine of its angle: squared,
-    # summed 12 / 2; a shift of the ring explains half of that.
-    lean = 2 * distance_m / (radius_px * radius_m * together)
-    assert math.radians(found.lean_deg) == pytest.approx(lean, rel=0.02)
-    assert math.radians(found.swing_deg) == pytest.approx(lean, rel=0.02)
-
-
-def test_a_bar_has_nearly_the_bound_of_its_boundaries() -> None:
-    # This one knows the outer edges, too, and that boundaries are LEDs beside each other.
-    link = load_link()
-    found = layout_bound(link, 50.0, range(16), blur_px=0.45, noise=0.3)
-    wanted = bar_bound(link, 50.0, range(16), blur_px=0.45, noise=0.3, columns=2)
-    assert found.distance_m == pytest.approx(wanted, rel=0.1)
-    assert math.isinf(found.swing_deg)
-    # What nothing says is infinite.
-    one = layout_bound(load_link(overrides=["bar.shape=table"]), 50.0, [3], blur_px=0.45, noise=0.3)
-    assert one.x_px == pytest.approx(one.y_px)
-    assert one.x_px < 0.2
-    assert one.distance_m > 1000
-    assert math.isinf(one.turn_deg)
-    assert math.isinf(one.lean_deg)
-
-
-def test_a_fit_of_drawn_images_scatters_as_the_bound_says() -> None:
-    layout = BarLayout(LedTable(((-0.1, -0.05, 0, 0), (0.12, -0.04, 0, 1), (0.02, 0.11, 0, 2), (0, 0, 0, 1))))
-    rng = np.random.default_rng(4)
-    codes = rng.choice([-1.0, 1.0], (3, 4))
-    names = ("x_px", "y_px", "scale", "turn", "gain", "dark", "blur")
-    true = np.array([0.2, -0.3, math.log(70.0), 0.1, 0.8, math.log(0.1), math.log(0.5)])
-    image = _Image.around(layout, 70.0, 0.5, codes, 50.0)
-
-    def values(fit: np.ndarray) -> np.ndarray:
-        return image.values(dict(zip(names, fit.tolist(), strict=True))).ravel()
-
-    clean, fits = values(true), []
-    for _ in range(12):
-        drawn = clean + rng.normal(0, 0.05, clean.size)
-        fits.append(least_squares(lambda fit, drawn=drawn: values(fit) - drawn, true, method="lm").x)
-    given = dict(zip(names, true.tolist(), strict=True))
-    slopes = np.stack([image.slope(given, name) for name in names])
-    bound = np.sqrt(np.diag(np.linalg.inv(slopes @ slopes.T / 0.05**2)))
-    # 48 squares of normal numbers tell their mean to 20 %.
-    assert np.mean(((np.array(fits) - true) / bound)[:, :4] ** 2) == pytest.approx(1, abs=0.6)
