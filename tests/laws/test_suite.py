@@ -148,23 +148,6 @@ def test_a_fault_is_blamed_on_the_algorithm_under_test_and_where_it_was():
     assert isinstance(fault.__cause__, KeyError)
 
 
-OTHER = (
-    "pilots.id=barker13",
-    "bar.rows=78",
-    "modulation.id=wh8",
-    "air.chip_rate_hz=5000",
-    "air.frames_per_packet=12",
-)
-
-
-@pytest.mark.parametrize("role", ["pilots", "separation", "decoding", "ranging"])
-def test_the_defaults_keep_their_laws_on_another_link(role):
-    link = load_link(overrides=OTHER)
-    for outcome in check(role, link.algorithms[role], link=link):
-        refused = outcome.status == "skipped" and "leaves every quantity as measured" in outcome.detail
-        assert outcome.status == "ok" or refused, f"{outcome.law.name}: {outcome.detail}"
-
-
 def test_a_law_sees_the_link_that_it_is_given():
     panel = load_link(
         overrides=["bar.rows=16", "bar.columns=16", "bar.cluster_rows=4", "bar.cluster_columns=4"]
