@@ -66,18 +66,6 @@ def test_what_is_no_block_is_told(change: dict[int, int], told: str) -> None:
         Block.unpack(bytes(block))
 
 
-@given(st.binary(min_size=21, max_size=99), st.data())
-def test_parts_of_two_messages_are_not_joined(payload: bytes, data: st.DataObject) -> None:
-    other = data.draw(st.binary(min_size=len(payload), max_size=len(payload)))
-    one, two = ([b.part for b in split(Message(Kind.DATA, 1, 2, m), DIGEST, 37)] for m in (payload, other))
-    mixed = [data.draw(st.sampled_from(pair)) for pair in zip(one, two, strict=True)]
-    if mixed in (one, two):
-        assert joined(mixed, len(payload)) in (payload, other)
-        return
-    with pytest.raises(BlockError, match="not those of one message"):
-        joined(mixed, len(payload))
-
-
 BEACON = dict.fromkeys(BEACON_NAMES, 1.0)
 BEYOND = (90.1, -181.0, math.nan, -1.0, 181.0, 0.0), (-90.1, 181.0, -13e3, 361.0, -1.0, 101.0)
 
@@ -100,12 +88,6 @@ BEYOND = (90.1, -181.0, math.nan, -1.0, 181.0, 0.0), (-90.1, 181.0, -13e3, 361.0
 def test_what_is_no_message_is_told(make: Callable[[], object], told: str) -> None:
     with pytest.raises((ConfigError, BlockError), match=told):
         make()
-
-
-def test_text_is_utf8() -> None:
-    assert Message(Kind.TEXT, 0, 0, "Tempo 30 für 2 km".encode()).text == "Tempo 30 für 2 km"
-    assert Message(Kind.TEXT, 0, 0, b"\xff").text is None
-    assert Message(Kind.DATA, 0, 0, b"Hi").text is None
 
 
 @given(
@@ -149,8 +131,3 @@ def value(bits: np.ndarray) -> int:
 def test_published_check_values(polynomial: int, start: int, check: int) -> None:
     got = value(crc24(NINE, polynomial, start))
     assert got == check, hex(got)
-
-
-def test_nothing_does_not_pass() -> None:
-    for length in range(1, 600):
-        assert crc24(np.zeros(length, np.uint8)).any()

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,14 +12,13 @@ from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import _SPECS, load_link, resolve
+from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.link.text import to_toml
 from evlcp_sdk.plugin.hooks import Algorithm
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
-from evlcp_sdk.scene.bar import BarLayout, LedGrid
+from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.specs import build
 from tests.conftest import Brings
 from tests.unit.mutants import refusal
 
@@ -64,21 +63,6 @@ def faults_of(registry: Registry, text: str, tmp_path: Path, *overrides: str) ->
     return str(caught.value).replace(f"{tmp_path}/", "").splitlines()
 
 
-def _ours() -> Iterator[type[Any]]:
-    """What a link is built of, sections and algorithms."""
-    registry = Registry.load()
-    yield from (*_SPECS.values(), LedGrid)
-    for role in ROLES:
-        for entry in registry.installed(role):
-            if entry.distribution == "evlcp-sdk":
-                yield registry.load_class(role, entry.algorithm.id)
-
-
-@pytest.mark.parametrize("cls", list(_ours()), ids=lambda cls: cls.__name__)
-def test_our_defaults_are_what_a_model_makes_of_nothing(cls: type[Any]) -> None:
-    assert repr(build(cls, {})) == repr(cls())
-
-
 TABLES = [
     *("camera", "camera_sigma", "bar", "air", "regions", "messages", "position", "detection", "framing"),
     *("pilots", "modulation", "synchronization", "separation", "decoding", "ranging", "tracking"),
@@ -95,19 +79,6 @@ def test_defaults_are_all_written_out(registry: Registry) -> None:
     assert link.algorithm("ranging") == FakeRanging()
     assert link.packet.packet_chips == 346
     assert json.loads(json.dumps(link.table)) == link.table
-
-
-@pytest.mark.parametrize(
-    ("override", "section", "key", "value"),
-    [
-        ("ranging.id=centroid", "ranging", "id", "centroid"),
-        ("ranging.trim = false", "ranging", "trim", False),
-        ("ranging.drop=[0, 1]", "ranging", "drop", [0, 1]),
-        ('ranging.kernel="gauss"', "ranging", "kernel", "gauss"),
-    ],
-)
-def test_overrides(registry: Registry, override: str, section: str, key: str, value: Any) -> None:
-    assert load_link(None, [override], registry).table[section][key] == value
 
 
 @pytest.mark.parametrize("override", ["ranging", "ranging.id", "=3", "ranging=3", ".id=3", "ranging.=3"])
