@@ -1,7 +1,6 @@
 """Rangings on bars of few clusters: what one refuses, another takes where its message says so."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -70,20 +69,6 @@ def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name, lay
         assert np.isnan([found.distance_m, found.sigma_m]).all()
     else:
         assert found.distance_m == pytest.approx(link.camera.distance_m(0.06, 8), rel=1e-3)
-
-
-@pytest.mark.parametrize("modulation", ["nrz", "ppm"])
-def test_joint_scale_reads_pilots_where_codewords_are_no_pair_codes(modulation):
-    link = link_with("16 clusters", f"modulation.id={modulation}")
-    measure = compiled(link)
-    view = ideal_view(link.codebook, np.arange(16))
-    found, true_m = measure(view), link.camera.distance_m(0.06, 8)
-    assert found.distance_m == pytest.approx(true_m, rel=1e-3)
-    # It is measured in the pilot's middle, and what comes behind says nothing.
-    assert found.late_chips == 0
-    info = view.sums.copy()
-    info[len(link.codebook.pilots[0]) :] *= -1
-    assert measure(replace(view, sums=info)) == found
 
 
 def test_joint_scale_refuses_pilots_of_other_codes():

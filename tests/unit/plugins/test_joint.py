@@ -229,31 +229,3 @@ def test_shifts_by_sign_and_by_repeated_values_are_found():
     assert_allclose(fit[5:], [0.04, 0.05], rtol=0.12)
     assert (weight > 0).all()
     assert np.abs(off).max() < 0.005
-
-
-def test_a_value_is_read_half_a_chip_before_its_second_chips_middle():
-    """Also where the image, held still by whole pixels, jumps between its chips."""
-    codes = random_codes(7)
-    place, values = 0.34 * (np.arange(32) + 0.5), np.empty((16, 150))
-    for i in range(16):
-        seen = 0.34 * (2 * i + 1) - np.rint(place[2 * i + 1])
-        values[i] = 0.6 * values_of(codes[:, i : i + 1], BOUNDARIES + seen, 150)[0]
-    fit, _ = fit_of(codes, 1.0, values, SPACING, place - np.rint(place))
-    # Spacing, place and drift.
-    assert_allclose(fit[:3], [SPACING, 0, 0], atol=1e-5)
-
-
-def test_a_wave_of_the_pixels_shows_in_the_boundaries():
-    """Boundaries seem off by 0.02 px times the sine of their place on the pixels."""
-    codes, spacing, b = random_codes(8), 8 + 1 / 15, np.arange(1, K) - K / 2
-    places = 74.7 + spacing * b
-    seem = places + 0.02 * np.sin(2 * np.pi * places)
-    fit, (off, weight, wave) = fit_of(codes, 1.0, 0.6 * values_of(codes, seem, 150), spacing)
-    assert_allclose(wave, np.sin(2 * np.pi * places), atol=0.2)
-    # What a straight line through the wave does not take up is left, and that it takes up is the spacing's.
-    terms = np.stack([np.ones(K - 1), b], 1)
-    line = np.linalg.lstsq(terms * np.sqrt(weight)[:, None], wave * np.sqrt(weight))[0]
-    # The fit takes some of it for what its own wave makes of boundaries that are half a pixel wide.
-    assert_allclose(off, 0.02 * (wave - terms @ line), atol=0.005)
-    assert np.corrcoef(off, wave - terms @ line)[0, 1] > 0.98
-    assert fit[0] - spacing == pytest.approx(0.02 * line[1], rel=0.25)

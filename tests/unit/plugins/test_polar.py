@@ -52,22 +52,6 @@ def received(coded, bit_error_rate, rng):
     return (2 * (1.0 - 2.0 * coded + sigma * rng.normal(size=len(coded))) / sigma**2).astype(np.float32)
 
 
-def test_the_sequence_is_in_order():
-    """A permutation that keeps the partial order of all channels (Schuerch 2016).
-
-    An input with one binary digit more is better, in the sequence too. So is one with a digit moved up by
-    one: there the sequence, which was made for lists, differs in 20 of 2304 pairs.
-    """
-    assert sorted(RELIABILITY) == list(range(1024))
-    place, against = np.argsort(RELIABILITY), []
-    for b in range(10):
-        without = np.flatnonzero(np.arange(1024) >> b & 1 == 0)
-        assert (place[without] < place[without | 1 << b]).all()
-        below = without[without << 1 >> b & 1 == 1]
-        against += (place[below] > place[below ^ (3 << b >> 1)]).tolist()
-    assert (len(against), sum(against)) == (2304, 20)
-
-
 def by_the_standard(message, length):
     """One codeword, from the text of 3GPP TS 38.212, 5.3.1.2 and 5.4.1, and docs/error-correction.md."""
     k = len(message) + 24

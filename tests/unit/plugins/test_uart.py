@@ -3,8 +3,6 @@
 import itertools
 import json
 import math
-import subprocess
-import sys
 from functools import cache
 
 import numpy as np
@@ -13,7 +11,6 @@ from evlcp_uart import _kernels
 from evlcp_uart.framing import Uart, read_characters
 from evlcp_uart.inference import infer
 from evlcp_uart.light import TICKS
-from scipy.io import savemat
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import packet_chips
@@ -24,7 +21,6 @@ from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import Events
-from tests.conftest import ROOT
 
 BAR = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
 BIT_504_US = 1e6 / 504
@@ -84,7 +80,7 @@ def wrong_bits(found, sent, data_bits):
     ("bit_hz", "clock", "mark_on", "late_us"),
     [
         (3125.0, 0.01, True, (60.0, 110.0)),
-        (3125.0, -0.02, False, (60.0, 350.0)),
+        (3125.0, -0.025, False, (60.0, 350.0)),
         (504.0, 0.02, True, (200.0, 600.0)),
         (10_000.0, -0.01, True, (40.0, 60.0)),
     ],
@@ -200,58 +196,31 @@ def test_the_pause_tells_characters_of_a_recording_that_begins_within_a_packet()
 
 @cache
 def dim(events, unseen, many):
-    """Characters that were sent by a dim light, what is seen of it, and those that are read."""
+    """Characters that were sent by a dim light, and those that are read."""
     rng = np.random.default_rng(17)
     sent = rng.integers(0, 128, many)
     light = seen(rng, levels_of(sent, 7, "even", 2), DIM_BIT_US, events=events, unseen=unseen)
-    return sent, light, read_characters(light.t_us, light.p, 3125.0, Uart(7, "even", 2))
+    return sent, read_characters(light.t_us, light.p, 3125.0, Uart(7, "even", 2))
 
 
 DIM_BIT_US = 323.2
-DIM = [((4.0, 3.0), 0.03, 160), ((8.0, 6.0), 0.01, 150)]
+DIM = (4.0, 3.0), 0.03, 160
 
 
-@pytest.mark.parametrize(("events", "unseen", "many"), DIM)
-def test_errors_are_those_of_a_receiver_that_knows_the_light(events, unseen, many):
-    """Beside one that is told when each character starts, how late events are, and how many come."""
-    bit_us = DIM_BIT_US
-    sent, light, found = dim(events, unseen, many)
-    assert len(found) >= many - 2
+@pytest.mark.parametrize(("light", "best"), [(DIM, 40 / 1120), (((8.0, 6.0), 0.01, 150), 6 / 1050)])
+def test_errors_are_those_of_a_receiver_that_knows_the_light(light, best):
+    """Its best: it is told when each character starts, how late events are, and how many come."""
+    sent, found = dim(*light)
+    assert len(found) >= len(sent) - 2
     starts = np.array([c.t_us for c in found])
-    nearest = [int(np.abs(starts - (20_000 + 40 + 11 * k * bit_us)).argmin()) for k in range(many)]
-    ours = wrong_bits([found[k].value for k in nearest], sent.tolist(), 7)
-
-    # The ideal one: likelihoods of all words from the densities that made the events.
-    def density(after_us, late_us):
-        safe = np.maximum(after_us, 1e-9)
-        spread = np.exp(-0.5 * (np.log(safe / late_us) / 0.5) ** 2) / (safe * 0.5 * math.sqrt(2 * math.pi))
-        return np.where(after_us > 0, spread, 0.0)
-
-    strengths = np.random.default_rng(0).gamma(8, 1 / 8, 32)
-
-    def evidence(at_us, on):
-        inside = (light.t_us + 0.5 > at_us) & (light.t_us + 0.5 < at_us + 4 * bit_us) & (light.p == on)
-        shape = density(light.t_us[inside] + 0.5 - at_us, (60.0, 110.0)[not on])
-        means = (events[0] if on else events[1]) * strengths
-        logs = np.log1p(means[:, None] * shape / 300e-6).sum(1) - means
-        burst = logs.max() + math.log(np.exp(logs - logs.max()).mean())
-        return float(np.logaddexp(math.log(max(unseen, 1e-9)), math.log(1 - unseen) + burst))
-
-    words = np.array([levels_of(np.array([w]), 7, "even", 2) for w in range(128)])
-    steps = np.diff(np.pad(words, ((0, 0), (1, 0)), constant_values=1), axis=1)
-    ideal = []
-    for k in range(many):
-        begin_us = 20_000 + 11 * k * bit_us
-        fall = np.array([evidence(begin_us + j * bit_us, False) for j in range(11)])
-        rise = np.array([evidence(begin_us + j * bit_us, True) for j in range(11)])
-        ideal.append(int(((steps < 0) @ fall + (steps > 0) @ rise).argmax()))
-    best = wrong_bits(ideal, sent.tolist(), 7)
+    due_us = 20_040 + 11 * DIM_BIT_US * np.arange(len(sent))
+    ours = wrong_bits([found[np.abs(starts - at).argmin()].value for at in due_us], sent.tolist(), 7)
     # Three standard deviations of the difference, at two wrong bits a wrong character.
-    assert ours <= 1.15 * best + 3 * math.sqrt(4 * best / (7 * many))
+    assert ours <= 1.15 * best + 3 * math.sqrt(4 * best / (7 * len(sent)))
 
 
 def test_llrs_tell_the_truth():
-    sent, _, found = dim(*DIM[0])
+    sent, found = dim(*DIM)
     assert len(found) == len(sent)
     right = np.array([c.value for c in found]) == sent
     quality = np.array([c.quality for c in found])
@@ -339,31 +308,6 @@ def test_packets_behind_another_pause_than_is_stated_are_whole(extra):
     assert tally.transmitters[0].clock_ppm() == pytest.approx(-1000, abs=100)
 
 
-@pytest.mark.parametrize("idle", ["off", "on"])
-def test_a_pause_has_no_characters(idle, tmp_path):
-    """Packets with long pauses between, rendered pixel by pixel: what is dark says nothing."""
-    framing = {"id": "uart", "idle": idle}
-    link = resolve({"bar": BAR, "air": {"frames_per_packet": 100}, "framing": framing})
-    packets = [compose(link, text=text, sequence=1)[0] for text in ("first", "second")]
-    pauses = [np.full((many, 1), idle == "on", np.uint8) for many in (1000, 2000)]
-    light = [part for k in (0, 1) for part in (pauses[k], packet_chips(packets[k], link.codebook))]
-    np.save(tmp_path / "chips.npy", np.concatenate(light))
-    scene = {
-        "duration_s": sum(map(len, light)) / link.air.chip_rate_hz,
-        "link": {table: dict(values) for table, values in link.table.items()},
-        "camera": dict(link.table["camera"]),
-        "lens": {"focus_m": 30.0},
-        "motion": {"distance_m": 30.0, "speed_mps": 0.0, "vib_rate_rad_s": 0.0},
-        "bars": [{"x_m": 0.0, "chips_file": str(tmp_path / "chips.npy")}],
-    }
-    receiver = Receiver(link)
-    with evlcp.simulate(scene, seed=1) as source:
-        found = [packet for events in source.chunks() for packet in receiver.feed(events)] + receiver.close()
-    assert {m.value for packet in found for m in packet.messages} == {"first", "second"}
-    # The chips come round and begin anywhere, so that one packet may be cut in two.
-    assert 198 <= sum(len(packet.frames) for packet in found) <= 200
-
-
 def test_a_bar_of_clusters_is_refused():
     with pytest.raises(ConfigError, match="framing 'uart': a bar of 16 clusters, expected one"):
         resolve({"framing": {"id": "uart"}})
@@ -421,21 +365,6 @@ def test_a_light_the_other_way_round_is_read(data_bits, parity, stop_bits, bit_h
     state, more = decoder.close(state)
     assert [c.value for c in found + more] == sent.tolist()
     assert state.given["frames_inverted"] == (len(sent) if (idle == "on") != mark_on else 0)
-
-
-@pytest.mark.parametrize("clock", [-0.025, 0.02])
-def test_a_text_is_read_from_its_first_stretch_on_whatever_the_clock(clock):
-    """A few characters follow the part that is learned from, and fit from another bit on, too."""
-    text = b"rag thou wander'st in his shade, When in eternal lines to time thou grow'st: So long as men can "
-    sent = np.frombuffer(text + b"brea", np.uint8).astype(np.int64)
-    levels = levels_of(sent, 7, "even", 2, True)
-    rng = np.random.default_rng(1001)
-    rng.integers(0, 500)
-    bit_us, cut = 320 * (1 + clock), float(rng.uniform(0, 11))
-    light = seen(rng, levels, bit_us, events=(14.0, 11.0), unseen=0.001, cut_bits=cut)
-    found = read_characters(light.t_us, light.p, 3125.0, Uart(7, "even", 2, first_bit="highest"))
-    assert found[0].bit_us == pytest.approx(bit_us, rel=1e-3)
-    assert wrong_bits([one.value for one in found[-98:]], sent[-98:].tolist(), 7) < 0.01
 
 
 def test_what_a_list_has_wrong_is_said(tmp_path, evlcp):
@@ -549,21 +478,3 @@ def test_a_bar_in_view_is_no_light_of_characters(framing, demo_raw):
     with evlcp.receive(demo_raw, [link]) as packets:
         assert list(packets) == []
         assert packets.counts["regions_opened"] == 0
-
-
-def test_the_beacons_bit_errors_are_those_against_the_text_that_is_repeated(tmp_path):
-    """Of two repetitions and a third, with three bits that were sent otherwise; and of a part of one."""
-    rng = np.random.default_rng(1)
-    text = np.append(rng.integers(32, 127, 618), 127)
-    for name, bit_hz, first, many, errors in (
-        ("3125hz_30m", 3125, 400, 1450, 3),
-        ("504hz_30m", 504, 99, 90, 1),
-    ):
-        sent = np.resize(np.roll(text, -first), many)
-        sent[[20, 40, 60][:errors]] ^= 4
-        levels = levels_of(sent, 7, "even", 2, True)
-        events = seen(rng, levels, 1e6 / bit_hz, events=(24.0, 20.0), noise_hz=50.0)
-        savemat(tmp_path / f"{name}.mat", {"event": 2.0 * events.p - 1, "event_t": events.t_us * 1e-6})
-    script = [sys.executable, str(ROOT / "benchmarks" / "beacons.py"), str(tmp_path)]
-    printed = subprocess.run(script, capture_output=True, text=True, check=True).stdout.splitlines()[2:]
-    assert [line.split(" | ")[3:5] for line in printed] == [["3 of 10150", "0.0003"], ["1 of 630", "0.0016"]]

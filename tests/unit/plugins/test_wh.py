@@ -162,24 +162,6 @@ def test_learned_likelihoods_decode_every_symbol_without_negative_events(profile
         assert soft.quality > 0.9
 
 
-@pytest.mark.parametrize("decoding", [MlSoft(), MotionFeedback()])
-def test_what_flickers_before_a_part_of_a_cluster_is_not_listened_to(decoding, monkeypatch):
-    """Half of the columns of each cluster say what a panel does, not the bar."""
-    book, rng = book_of(), np.random.default_rng(0)
-    symbols = rng.integers(64, size=CLUSTERS)
-    sums = ideal_sums(book, symbols, missing=0.3, seed=0, **SHAPE)
-    lit = np.abs(sums).sum(0) > 0
-    seen = np.flatnonzero(lit.any(0))
-    columns = seen[: np.ptp(seen) // 2 + 1]
-    flicker = rng.integers(-2, 3, (len(sums), 1, 1))
-    sums[:, :, columns] = flicker * lit[:, columns]
-    decode = decoding.compile(book)
-    presence = ideal_presence(CLUSTERS, **SHAPE)
-    assert_array_equal(decode(presence, sums).symbols, symbols)
-    monkeypatch.setattr("evlcp_wh.decoding._PIXEL_SHARE", 1 - 1e-9)
-    assert (decoding.compile(book)(presence, sums).symbols != symbols).any()
-
-
 def drifting(book, right_down, seed):
     """Symbols, sums and path of a bar that stands still in its pilot and drifts away in its info segment."""
     symbols = np.random.default_rng(seed).integers(len(book.codewords), size=CLUSTERS)
