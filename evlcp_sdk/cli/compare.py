@@ -57,17 +57,7 @@ def compare(
     and --set hold for all variants. The best of each column has a *. The last row is the Cramer-Rao bound of
     the frames' distances: no unbiased ranging from one frame can do better.
     """
-    from evlcp_sdk.files import check_output
-
-    names = [path for path in out or [] if path.suffix not in (".csv", ".html", ".json")]
-    if names:
-        raise typer.BadParameter(
-            f"{names[0]}: expected a name that ends in .csv, .html or .json", param_hint="-o"
-        )
-    for path in out or []:
-        if not path.parent.is_dir():
-            raise OutputError(f"{path}: cannot be written: no folder {path.parent}")
-        check_output(path, regular=False)
+    _check_outputs(out or [])
     if any(map(_is_campaign, recordings)):
         if variants or link_files or overrides or len(recordings) > 1:
             raise typer.BadParameter(
@@ -84,6 +74,20 @@ def compare(
         else:
             _show(comparison, out or [])
     raise typer.Exit(code)
+
+
+def _check_outputs(out: Sequence[Path]) -> None:
+    """See that tables can be written here, before the work is done."""
+    from evlcp_sdk.files import check_output
+
+    for path in out:
+        if path.suffix not in (".csv", ".html", ".json"):
+            raise typer.BadParameter(
+                f"{path}: expected a name that ends in .csv, .html or .json", param_hint="-o"
+            )
+        if not path.parent.is_dir():
+            raise OutputError(f"{path}: cannot be written: no folder {path.parent}")
+        check_output(path, regular=False)
 
 
 def _is_campaign(url: str) -> bool:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -18,11 +18,17 @@ from evlcp_sdk.cli._receiving import CameraOptions, Cores, LinkOptions, PlaceOpt
 from evlcp_sdk.cli._summary import delays_text, print_end
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
+    from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.live.loop import LiveStatus
     from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.live.services import Serving
+    from evlcp_sdk.place.navigator import PositionPlan
+    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.plugin.source import EventSource
+    from evlcp_sdk.signals import Stopped
+    from evlcp_sdk.utc import ClockZero
 
 _HERE = "127.0.0.1"
 _SERVED = {"view": "look on", "nmea": "NMEA", "gpsd": "gpsd's JSON"}
@@ -88,6 +94,14 @@ class ServingOptions:
         )
 
 
+Waiting = Annotated[
+    float,
+    typer.Option(
+        "--waiting-ms", hidden=True, min=1.0, help="How long events may wait before some are left out."
+    ),
+]
+
+
 @command
 def live(
     *,
@@ -97,12 +111,7 @@ def live(
     place: PlaceOptions,
     camera: CameraOptions,
     reconnect: Annotated[bool, typer.Option("--reconnect", help="Go on when a camera is back.")] = False,
-    waiting_ms: Annotated[
-        float,
-        typer.Option(
-            "--waiting-ms", hidden=True, min=1.0, help="How long events may wait before some are left out."
-        ),
-    ] = 20.0,
+    waiting_ms: Waiting = 20.0,
     cores: Cores = 1,
     serving: ServingOptions,
 ) -> None:
@@ -117,13 +126,8 @@ def live(
 
     What comes too fast is left out, and counted. Ctrl-C ends it.
     """
-    from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
-    from evlcp_sdk.io.open import open_source
-    from evlcp_sdk.io.reconnect import ReconnectingSource
-    from evlcp_sdk.link.several import named_links
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.publisher import Publisher
-    from evlcp_sdk.live.services import serve
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import live as run_live
     from evlcp_sdk.signals import stop_on_request
@@ -136,19 +140,13 @@ def live(
     chosen = serving.chosen(out, positions=plan is not None)
     sinks = result.names(registry, positions=plan is not None)
     attitude, publisher = camera.attitude(place), Publisher()
-    sites = plan.sites if plan is not None else ()
     with (
         stop_on_request() as stopped,
-        serve(
-            chosen, publisher, named_links(links), name=Path(url).name, sites=sites, clock_zero=clock
-        ) as services,
+        _served(chosen, publisher, links, url, plan, clock),
         _going_on(publisher, silent=lines is not None),
     ):
-        for name, server in services.items():
-            complain(f"{_SERVED[name]} at {server.url}")
-        source = ReconnectingSource(partial(open_source, url, registry), stopped) if reconnect else url
         summary = run_live(
-            source,
+            _reconnecting(url, registry, stopped) if reconnect else url,
             out,
             links,
             registry=registry,
@@ -163,11 +161,48 @@ def live(
             stopped=stopped.or_when(lambda: out is None and lines is not None and lines.gone),
         )
         print_end(summary, out, lines, as_json=result.as_json)
-        if stopped() and out is not None:
-            raise InterruptedRunError(f"interrupted; what was decoded until then is in {out}")
-    fault = UnpluggedError if summary["live"]["unplugged"] else InputError
-    failed = summary["status"] == "failed"
-    raise typer.Exit(fault.exit_code if failed else int(lines is not None and lines.failed))
+        code = _exit_code(summary, out if stopped() else None)
+    raise typer.Exit(code or int(lines is not None and lines.failed))
+
+
+@contextmanager
+def _served(
+    chosen: Serving,
+    publisher: Publisher,
+    links: Sequence[Link],
+    url: str,
+    plan: PositionPlan | None,
+    clock: ClockZero,
+) -> Iterator[None]:
+    """Serve what was chosen, and say where."""
+    from evlcp_sdk.link.several import named_links
+    from evlcp_sdk.live.services import serve
+
+    sites = plan.sites if plan is not None else ()
+    names = named_links(links)
+    with serve(chosen, publisher, names, name=Path(url).name, sites=sites, clock_zero=clock) as services:
+        for name, server in services.items():
+            complain(f"{_SERVED[name]} at {server.url}")
+        yield
+
+
+def _reconnecting(url: str, registry: Registry, stopped: Stopped) -> EventSource:
+    """A source that is opened again whenever it ends by a fault."""
+    from evlcp_sdk.io.open import open_source
+    from evlcp_sdk.io.reconnect import ReconnectingSource
+
+    return ReconnectingSource(partial(open_source, url, registry), stopped)
+
+
+def _exit_code(summary: dict[str, Any], interrupted: Path | None) -> int:
+    """The code of a run that failed; 0 of one that did not; raises for one that was interrupted."""
+    from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
+
+    if interrupted is not None:
+        raise InterruptedRunError(f"interrupted; what was decoded until then is in {interrupted}")
+    if summary["status"] != "failed":
+        return 0
+    return (UnpluggedError if summary["live"]["unplugged"] else InputError).exit_code
 
 
 @contextmanager

@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from evlcp_sdk.cli._campaign import campaign_bar, show_faults
 from evlcp_sdk.cli._common import Dask, Json, Workers, console, make_executor, print_json
 
+if TYPE_CHECKING:
+    from evlcp_sdk.study.collect import Progress
+
+
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        "-o", "--out", metavar="RESULTS.sqlite", help="Results; NAME.sqlite without it.", show_default=False
+    ),
+]
+
 
 def sweep(
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="The campaign.")],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--out",
-            metavar="RESULTS.sqlite",
-            help="Results; NAME.sqlite without it.",
-            show_default=False,
-        ),
-    ] = None,
+    out: Out = None,
     workers: Workers = None,
     dask: Dask = None,
     overrides: Annotated[
@@ -75,11 +77,17 @@ def sweep(
         numbers = {k: v for k, v in asdict(progress).items() if k != "faults"}
         print_json({"results": str(path), **numbers, "failed": len(progress.faults)})
     else:
-        console().print(
-            f"{plan.name}: {progress.done} of {progress.tasks} tasks,"
-            f" {progress.points_done} of {progress.points} points,"
-            f" {progress.bit_errors:,} of {progress.bits:,} bits wrong"
-        )
-        if not dry_run:
-            console().print(f"written: {path}; look at it: evlcp report {path} -o report.html", style="dim")
+        _show(plan.name, progress, None if dry_run else path)
     raise typer.Exit(max((fault.exit_code for _, fault in progress.faults), default=0))
+
+
+def _show(name: str, progress: Progress, written: Path | None) -> None:
+    """Say how far a campaign is, and where its results are."""
+    screen = console()
+    screen.print(
+        f"{name}: {progress.done} of {progress.tasks} tasks,"
+        f" {progress.points_done} of {progress.points} points,"
+        f" {progress.bit_errors:,} of {progress.bits:,} bits wrong"
+    )
+    if written is not None:
+        screen.print(f"written: {written}; look at it: evlcp report {written} -o report.html", style="dim")

@@ -10,6 +10,16 @@ import typer
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, print_json
 from evlcp_sdk.suggestions import counted
 
+From = Annotated[
+    float | None,
+    typer.Option(
+        "--from-ms",
+        min=0,
+        help="Start, after the first event.  [default: the first frame that is decoded]",
+        show_default=False,
+    ),
+]
+
 
 def video(
     recording: Annotated[
@@ -20,15 +30,7 @@ def video(
     ],
     link_files: LinkFiles = None,
     overrides: Overrides = None,
-    from_ms: Annotated[
-        float | None,
-        typer.Option(
-            "--from-ms",
-            min=0,
-            help="Start, after the first event.  [default: the first frame that is decoded]",
-            show_default=False,
-        ),
-    ] = None,
+    from_ms: From = None,
     for_ms: Annotated[
         float, typer.Option("--for-ms", min=0.001, help="How much of the recording to show.")
     ] = 20.0,

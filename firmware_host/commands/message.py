@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from evlcp_sdk.link.resolve import Link
+    from firmware_host.board.board import Board, Programmed
     from firmware_host.board.messages import Content
 
 _MOST_NUMBER = 2**32 - 1
@@ -134,6 +135,24 @@ class LineOptions:
         return None if port is None else BoardLine(port, self.baud, key=self.board_key)
 
 
+@dataclass(frozen=True)
+class AnewOptions:
+    """How often it is sent anew."""
+
+    every: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            min=1.0,
+            help="Send it anew so often, with {time}, {left} and {n} in the text.",
+        ),
+    ] = None
+    count: Annotated[
+        int | None, typer.Option(hidden=True, min=1, help="With --every: end after so many.")
+    ] = None
+    ahead: Ahead = 2
+
+
 @command
 def message(
     *,
@@ -149,18 +168,7 @@ def message(
         typer.Option(metavar="FILE.npy", help="Write the chips: a row per chip."),
     ] = None,
     board: LineOptions,
-    every: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            min=1.0,
-            help="Send it anew so often, with {time}, {left} and {n} in the text.",
-        ),
-    ] = None,
-    count: Annotated[
-        int | None, typer.Option(hidden=True, min=1, help="With --every: end after so many.")
-    ] = None,
-    ahead: Ahead = 2,
+    anew: AnewOptions,
     stay: KeepAlive = False,
     link_file: LinkFile = None,
     overrides: Overrides = None,
@@ -174,30 +182,22 @@ def message(
     A countdown:     [bold]evlcp tx message --countdown 30 --every 1 --port /dev/ttyUSB0[/]
     """
     from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
-    from firmware_host.board.bank import bank_of, symbol_chips
-    from firmware_host.board.board import Settings, provision
     from firmware_host.board.symbols import symbols_table
 
     link = load_link(link_file, overrides or [], Registry.load())
     made = content.content()
-    if every is None and count is not None:
+    if anew.every is None and anew.count is not None:
         raise ConfigError("--count belongs to --every SECONDS")
-    if every is not None:
+    if anew.every is not None:
         if out is not None or chips is not None:
             raise ConfigError("--every sends what changes, to a board: -o and --chips hold what stays")
-        _send_anew(made, link, board.line(), repeat, every, count, ahead, as_json=as_json)
+        _send_anew(made, link, board.line(), repeat, anew.every, anew, as_json=as_json)
         return
     symbols, summary = _compose(made, link, repeat)
     table = symbols_table(symbols, link, messages=True)
-    with Outputs() as outputs:
-        if chips is not None:
-            outputs.write_array(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chips)
-        if out is not None:
-            outputs.write_text(json.dumps(table) + "\n", out)
-        outputs.commit()
+    _write(symbols, link, table, out, chips)
     written = [str(path) for path in (out, chips) if path is not None]
     line = board.line(only_named=bool(written))
     said = _describe(summary, written)
@@ -206,15 +206,37 @@ def message(
         if not written and not as_json:
             raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
         return
-    bank = bank_of(symbols, link)
     with line.open() as opened:
-        with progress_bar("programming") as progress:
-            done = provision(opened, bank, Settings(), True, progress)
+        done = _program(opened, symbols, link)
         say(f"{said}, again and again", summary | {"board": asdict(done)} | table, as_json)
         if not as_json:
             say_done(done, as_json)
         if stay:
             keep_alive(opened)
+
+
+def _write(
+    symbols: NDArray[np.int64], link: Link, table: dict[str, Any], out: Path | None, chips: Path | None
+) -> None:
+    """Write the symbols' table and the chips, where that is asked for."""
+    from evlcp_sdk.files import Outputs
+    from firmware_host.board.bank import symbol_chips
+
+    with Outputs() as outputs:
+        if chips is not None:
+            outputs.write_array(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chips)
+        if out is not None:
+            outputs.write_text(json.dumps(table) + "\n", out)
+        outputs.commit()
+
+
+def _program(board: Board, symbols: NDArray[np.int64], link: Link) -> Programmed:
+    """Have a board send symbols again and again."""
+    from firmware_host.board.bank import bank_of
+    from firmware_host.board.board import Settings, provision
+
+    with progress_bar("programming") as progress:
+        return provision(board, bank_of(symbols, link), Settings(), True, progress)
 
 
 def _send_anew(
@@ -223,8 +245,7 @@ def _send_anew(
     line: BoardLine | None,
     repeat: int,
     every_s: float,
-    count: int | None,
-    ahead: int,
+    anew: AnewOptions,
     *,
     as_json: bool,
 ) -> None:
@@ -240,9 +261,9 @@ def _send_anew(
     # What is wrong is known before the board waits for it.
     check_interval(content, link, repeat, every_s)
     with line.open() as board:
-        stream = board.stream(link, ahead)
+        stream = board.stream(link, anew.ahead)
         with suppress(KeyboardInterrupt), stop_on_request() as stopped, stream:
-            send_anew(stream, content, link, repeat, every_s, count, stopped)
+            send_anew(stream, content, link, repeat, every_s, anew.count, stopped)
     say_stream(stream, as_json)
 
 
