@@ -130,26 +130,18 @@ def test_a_list_is_read_from_its_first_character_wherever_time_begins(seed, firs
         (10_000.0, (60.0, 50.0), (25.0, 30.0), 25),
     ],
 )
-def test_times_that_are_coarse_are_read_in_any_pieces(rate_hz, events, late_us, grain_us):
+def test_times_that_are_coarse_are_read(rate_hz, events, late_us, grain_us):
     """As a list rounds them, or a camera reads its events out in bunches that shift against the bits."""
     sent = np.random.default_rng(1).integers(0, 128, 60)
     bit_us = 1e6 / rate_hz * 1.002
     rng, levels = np.random.default_rng(9), levels_of(sent, 7, "even", 2)
     light = seen(rng, levels, bit_us, events=events, late_us=late_us)
     t_us, p = (light.t_us // grain_us + 1) * grain_us, light.p
-    uart = Uart(7, "even", 2)
-    found = read_characters(t_us, p, rate_hz, uart)
+    found = read_characters(t_us, p, rate_hz, Uart(7, "even", 2))
     starts = 20_000 + 11 * bit_us * np.arange(len(sent))
     at = {int(np.abs(starts - one.t_us).argmin()): one.value for one in found}
     assert len(at) == len(found) >= len(sent) - 1
     assert sum((value ^ int(sent[k])).bit_count() for k, value in at.items()) <= 1
-    decoder = uart.decoder(rate_hz)
-    state, again = decoder.init(), []
-    for k in range(0, len(t_us), 37):
-        state, more = decoder.step(state, t_us[k : k + 37], p[k : k + 37], int(t_us[k : k + 37][-1]))
-        again += more
-    again += decoder.close(state)[1]
-    assert [(one.t_us, one.value) for one in again] == [(one.t_us, one.value) for one in found]
 
 
 @pytest.mark.parametrize("cut", [0, 3, 8])

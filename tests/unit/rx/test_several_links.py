@@ -23,20 +23,13 @@ BAR = named("bar")
 HALF = named("half", bar={"rows": 48})
 SLOW = named("slow", air={"chip_rate_hz": 5000.0})
 WH8 = named("wh8", modulation={"id": "wh8"})
-LAMP = named(
-    "lamp",
-    bar={"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1},
-    framing={"id": "uart", "parity": "even"},
-    air={"chip_rate_hz": 5000.0},
-)
 LEFT, RIGHT = 300.3, 800.7
 
 
 def at(link, x_px, seconds=0.12, start_us=5000.0):
     """A transmitter at a column for some time, and its events."""
     packets = max(int(seconds * link.packet.chip_rate_hz / link.packet.packet_chips), 1)
-    small = {} if link.codebook.clusters == 1 else {"cluster_px": 4.0, "width_px": 2}
-    return lit(packets, int(x_px), link, x_px=x_px, start_us=start_us, **small)
+    return lit(packets, int(x_px), link, x_px=x_px, start_us=start_us, cluster_px=4.0, width_px=2)
 
 
 def right(packets, link, bar):
@@ -47,15 +40,12 @@ def right(packets, link, bar):
     return right_frames(here, bar, link, late_us=(-near_us, near_us))
 
 
-@pytest.mark.parametrize(
-    "links", [(BAR, HALF), (BAR, SLOW), (BAR, WH8), (WH8, BAR), (BAR, LAMP)], ids=lambda links: links[-1].name
-)
+@pytest.mark.parametrize("links", [(BAR, HALF), (WH8, BAR)], ids=lambda links: links[-1].name)
 def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(links):
     (one, here), (two, there) = at(links[0], LEFT), at(links[1], RIGHT)
     receiver, packets = received(list(links), merged(here, there))
     assert right(packets, links[0], one) == len(one.symbols) * 10
-    # Of a character that the stream's start cuts, or whose packet's place is not told, nothing is said.
-    assert right(packets, links[1], two) >= len(two.symbols) * 10 - 2 * (links[1] is LAMP)
+    assert right(packets, links[1], two) == len(two.symbols) * 10
     numbers = {p.transmitter: p.link for p in packets}
     assert Counter(numbers.values()) == {link.name: 1 for link in links}
     counts = receiver.counts
