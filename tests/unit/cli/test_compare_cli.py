@@ -10,11 +10,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.sim import read_truth
-from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.frames import read_frames
-from evlcp_sdk.study.jobs import Inline
-from evlcp_sdk.study.store import Store
-from tests.unit.study.fake import fake_plan, run_fake
 
 Evlcp = Callable[..., Any]
 REC_WH8 = (
@@ -128,17 +124,3 @@ def test_of_several_recordings_the_others_are_compared(evlcp: Evlcp, recording: 
     assert first == f"evlcp: {none}: No such file or directory"
     assert second.startswith(f"evlcp: {tmp_path}/torn.truth.json: not JSON")
     assert [row["recording"] for row in json.loads(done.out)["rows"]] == [str(recording)]
-
-
-def test_results_of_a_campaign(evlcp: Evlcp, tmp_path: Path) -> None:
-    results = tmp_path / "results"
-    assert evlcp("compare", tmp_path / "r.sqlite").code == 3
-    with Store(results, create=True) as store:
-        collect(fake_plan(scenes=2), store, Inline(), run_fake)
-    assert evlcp("compare", results, "--variant", "a:").code == 2
-    rows = json.loads(evlcp("compare", results, "--json").out)["rows"]
-    assert len(rows) == 6
-    done = evlcp("compare", results)
-    assert (done.code, done.err) == (0, "")
-    for text in ("distance 30 m", "distance 40 m", "all scenes", "link 0", "link 1", "campaign fake"):
-        assert text in done.out

@@ -1,20 +1,16 @@
 """The report: what the page holds, that it needs no network, and that a browser draws it."""
 
-import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from evlcp_sdk.cli.report import as_markdown
-from evlcp_sdk.files import Outputs
-from evlcp_sdk.report.drawing import save_plots
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.comparison import of_campaign
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.plan import Case, Job, Plan
-from evlcp_sdk.study.report import POSITION_HEAD, charts_of, page, position_rows
+from evlcp_sdk.study.report import POSITION_HEAD, page, position_rows
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import PAPER, Series, Summary, beside_paper, summarize
 from evlcp_sdk.study.tally import Statistics, Tally
@@ -96,43 +92,6 @@ def test_a_smaller_figure_is_better_and_a_kept_bound_agrees(summary: Summary) ->
             at = Statistics.of([(reference.from_m, tally)], tasks=1)
             (one,) = beside_paper([Series({}, {"speed_kmh": 30}, link, (at,))], [reference])
             assert one.verdict == verdict, (reference, factor)
-
-
-def test_json_has_every_figure(summary: Summary) -> None:
-    table = json.loads(json.dumps(summary.to_dict(), allow_nan=False))
-    assert len(table["series"]) == 4
-    first = table["series"][0]["segments"][0]
-    assert first["ber"]["value"] == first["bit_errors"] / first["bits"]
-    assert {"ours", "verdict", "value"} <= set(table["paper"][0])
-
-
-def test_a_limit_stands_above_the_paper_for_no_want_of_data(summary: Summary) -> None:
-    """3.7 / 400 distances are a limit above the paper's .004, 3.7 / 1200 are none."""
-    link = summary.series[0].link
-    for wrong, shown in ((0, ["30 to 60 m: below 0.0031"]), (1, ["30 to 40 m", "40 to 50 m", "50 to 60 m"])):
-        tallies = [Tally.distance(0.0)] * (400 - wrong) + [Tally.distance(0.6)] * wrong
-        at = Statistics.of([(m, tally) for m in (30, 40, 50) for tally in tallies], tasks=1)
-        series = Series({"scene.speed_kmh": 30}, {"speed_kmh": 30}, link, (at,))
-        charts = charts_of(replace(summary, series=(series,)))
-        (gross,) = (one for one in charts if one.id == "gross")
-        assert [one.verdict for one in beside_paper([series]) if one.reference.measure == "gross_share"] == [
-            "better"
-        ]
-        few = Series({}, {"speed_kmh": 30}, link, (Statistics.of([(30, Tally.distance(0.0))], tasks=1),))
-        assert "too few" in {one.verdict for one in beside_paper([few])}
-        gross.markup()
-        seen = [text.splitlines()[1] for *_, text, _ in gross.labels if text.startswith(series.name)]
-        assert all(text.startswith(want) for text, want in zip(seen, shown, strict=True)), seen
-
-
-def test_charts_are_saved_as_png_and_svg(summary: Summary, tmp_path: Path) -> None:
-    with Outputs() as outputs:
-        written = save_plots(charts_of(summary), summary.plan.name, tmp_path / "figures", outputs)
-        assert not any(path.exists() for path in written)
-        outputs.commit()
-    assert [p.name for p in written] == [f"{c}.{kind}" for c in CHARTS for kind in ("png", "svg")]
-    for path in written:
-        assert path.read_bytes().startswith((b"\x89PNG", b"<?xml"))
 
 
 def test_the_page_tells_everything(summary: Summary) -> None:

@@ -36,9 +36,8 @@ def test_events_are_those_written(name, kind, faery, tmp_path):
 
 
 @pytest.mark.parametrize(("name", "kind"), NAMES.items())
-@pytest.mark.parametrize("data", [b"", b"\x89PNG\r\n\x1a\n" + bytes(90)], ids=["empty", "PNG"])
-def test_bad_file_is_an_error(name, kind, data, faery, tmp_path):
-    (tmp_path / name).write_bytes(data)
+def test_bad_file_is_an_error(name, kind, faery, tmp_path):
+    (tmp_path / name).write_bytes(b"")
     with pytest.raises(InputError, match=f"{name}: found no {kind} file, expected one"):
         open_source(tmp_path / name)
 
@@ -57,8 +56,3 @@ def test_missing_package_is_named_with_the_way_to_install_it(monkeypatch, tmp_pa
     monkeypatch.setitem(sys.modules, "faery", None)
     with pytest.raises(InputError, match=r"pip install 'evlcp-sdk\[faery\]'"):
         open_source(tmp_path / "a.es")
-
-
-def test_another_scheme_before_such_a_name_is_not_its_file():
-    with pytest.raises(InputError, match=r"^none\.dat: No such file"):
-        open_source("replay:none.dat")

@@ -11,7 +11,7 @@ import threading
 import numpy as np
 import pytest
 
-from evlcp_sdk.errors import InputError, RawFormatError, StreamError
+from evlcp_sdk.errors import InputError, RawFormatError
 from evlcp_sdk.io import RawSource, open_source, write_events
 from evlcp_sdk.io.raw import CODECS, format_header, parse_header
 from evlcp_sdk.values import Events
@@ -34,11 +34,7 @@ def some_events(n=3000):
 BAD_HEADERS = {
     "empty file": (b"", 0, "an empty file", "a RAW header"),
     "PNG": (b"\x89PNG\r\n\x1a\n" + bytes(50), 0, "89 50 4e 47", "'% '"),
-    "no header": (np.array(GOOD * 10, "<u2").tobytes(), 0, "01 80 02 60", "'% '"),
-    "text": (b"hello\n", 0, "68 65 6c 6c 6f 0a", "'% '"),
     "no encoding": (b"% date today\n% end\n", 0, "a header without encoding", "'% evt 3.0'"),
-    "empty header": (b"% end\n", 0, "a header without encoding", "'% evt 3.0'"),
-    "EVT 2.1": (b"% evt 2.1\n% end\n", 0, "'% evt 2.1'", "2.0 or 3.0"),
     "EVT4": (b"% date x\n% format EVT4;height=1;width=1\n% end\n", 9, "'% format EVT4;", "EVT2 or EVT3"),
     "two encodings": (b"% evt 2.0\n% format EVT3\n% end\n", 0, "'% evt 2.0' beside '% format EVT3'", "one"),
     "two sizes": (
@@ -47,15 +43,9 @@ BAD_HEADERS = {
     ),
     "a line twice": (b"% geometry 4x4\n% geometry 5x4\n% end\n", 15, "a second", "'% geometry 4x4'"),
     "zero width": (b"% evt 3.0\n% geometry 0x4\n% end\n", 10, "'% geometry 0x4'", "from 1 to 2048"),
-    "negative height": (b"% evt 3.0\n% geometry 4x-5\n% end\n", 10, "'% geometry 4x-5'", "from 1 to 2048"),
-    "half a geometry": (b"% evt 3.0\n% geometry 1280\n% end\n", 10, "'% geometry 1280'", "from 1 to 2048"),
     "huge width": (b"% format EVT3;height=720;width=99999\n% end\n", 0, "width=99999", "from 1 to 2048"),
-    "digits of another script": (
-        *("% evt 3.0\n% geometry \u0661x4\n% end\n".encode(), 10, "'% geometry \u0661x4'", "from 1 to 2048"),
-    ),
     "binary in the header": (b"% evt 3.0\n% \xff\x00\n% end\n", 10, r"b'% \xff", "a header line"),
     "header cut": (b"% evt 3.0\n% forma", 10, "b'% forma'", "ended by a line feed"),
-    "endless line": (b"% evt 3.0\n% " + b"x" * 100_000, 10, "b'% xxx", "ended by a line feed"),
 }
 
 
@@ -135,14 +125,6 @@ def test_directory(name, tmp_path):
         open_source(tmp_path / name)
 
 
-def test_pieces_of_no_events_are_refused(tmp_path):
-    with (
-        open_source(raw(tmp_path / "a.raw", GOOD)) as source,
-        pytest.raises(StreamError, match="max_events is 0"),
-    ):
-        next(source.stream(0))
-
-
 @pytest.mark.parametrize("bytes_at_a_time", [1000, 4099, 70_001])
 def test_a_pipe_gives_what_is_there(bytes_at_a_time):
     """Words in pieces of any size are read as if they came at once, and given before the next ones come."""
@@ -192,13 +174,3 @@ def test_standard_input_is_a_recording(tmp_path):
     os.close(outside)
     assert done.returncode == 3
     assert "standard input is a terminal, expected a recording" in done.stderr
-
-
-def test_formats_that_cannot_be_written(tmp_path):
-    with pytest.raises(StreamError, match=r"suffix '\.txt', expected \.raw"):
-        write_events(tmp_path / "a.txt", Events.empty())
-    with pytest.raises(StreamError, match="format 'EVT4'"):
-        write_events(tmp_path / "a.raw", Events.empty(), 1, 1, format="EVT4")
-    with pytest.raises(StreamError, match="expected a width and a height for EVT3"):
-        write_events(tmp_path / "a.raw", Events.empty())
-    assert list(tmp_path.iterdir()) == []

@@ -7,7 +7,6 @@ import pytest
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import open_source, read_events
-from evlcp_sdk.io.columns import PIECE_ROWS
 from evlcp_sdk.io.fields import fields_of, time_unit
 from evlcp_sdk.values import Events
 from tests.unit.io.writers import (
@@ -52,7 +51,6 @@ def text(*columns, head="", mark=",", form="%s"):
 
 LISTS = {
     "us": text(T_US, P, head="t,p"),
-    "us named, polarity -1": text(T_US, SIGNS, head="t_us,polarity"),
     "ns": text(T_US * 1000, P, head="timestamp,pol"),
     "minutes of nanoseconds": text(T_US * 1000 + 7, P, head="t,p"),
     "ms": text(T_US * 1e-3, P, head="t,p", form="%.3f"),
@@ -60,49 +58,30 @@ LISTS = {
     "no heading": text(T_US, P, mark=" "),
     "tabs and exponents": text(T_S, P, head="t\tp", mark="\t", form="%.6e").replace("e-0", "e-"),
     "windows": text(T_US, P, head="t,p").replace("\n", "\r\n"),
-    "no last line end": text(T_US, P, head="t,p").rstrip("\n"),
-    "True and False": text(T_US, P > 0, head="t,p"),
     "of a plot": text(P, T_S, head="Polarity,Time [s]", form="%.6f"),
-    "seconds, spelled": text(T_S, SIGNS, head='"timestamp (seconds)","event"', form="%.6f"),
     "as the beacon's authors call them": text(T_S, SIGNS, head="event_t,event", form="%.6f"),
     "words": text(T_US, np.where(P == 1, "ON", "OFF"), head="time_us,polarity"),
-    "words, no last line end": text(T_US, np.where(P == 1, "ON", "OFF"), head="t,p").rstrip("\n"),
     "words, no heading": text(np.where(P == 1, "ON", "OFF"), T_US, mark="\t"),
-    "rising and falling": text(T_US, np.where(P == 1, "rising", "falling"), head="t,type"),
     "with an index": text(ROWS, T_US, P, head=",t,p"),
     "polarity first, no heading": text(SIGNS, T_S, mark=" ", form="%.6f"),
-    "floats throughout": text(T_US * 1.0, P * 1.0, form="%.1f"),
     "comments": "# a beacon, 30 m\n% t p\n\n" + text(T_US, P, mark="  ") + "// end\n",
-    "savetxt": "# t,p\n" + text(T_US * 1.0, SIGNS * 1.0, form="%.18e"),
     "decimal comma": text(T_S, P, head="t;p", mark=";", form="%.6f").replace(".", ","),
-    "decimal comma and blanks": text(T_S, P, mark=" ", form="%.6f").replace(".", ","),
     "decimal commas in quotes": text(T_S, P, head="t,p", form='"%.6f"').replace(".", ","),
-    "blanks around": text(T_US, P, head="t , p", mark=" , "),
-    "right-aligned": "".join(f"{t:>12d} {p:>3d}\n" for t, p in zip(T_US, SIGNS, strict=True)),
-    "ts is a time, and no seconds": text(T_US, P, head="ts,p"),
     "unit in words": text(T_US, P, head="time in microseconds,polarity"),
-    "a unit for a name": text(T_S, P, head="seconds,pol", form="%.6f"),
     "units of polarity": text(T_US, P, head="t [us],p [0/1]"),
     "what polarity is": text(T_US, P, head="t (us),polarity (1=ON 0=OFF)"),
-    "t of events": text(T_US, P, head="t_event,p_event"),
-    "a state": text(T_US, P, head="t,is_on"),
-    "elapsed": text(T_US * 1e-3, P, head="elapsed_ms,event_type", form="%.3f"),
     "numbers of rows, no heading": text(ROWS, T_US, P),
-    "numbers of rows from 1": text(ROWS + 1, T_S, SIGNS, mark=" ", form="%.6f"),
     "the same throughout, no heading": text(T_US, P, np.full(N, 7)),
     "as R writes it": text(ROWS + 1, T_US, P, head='"t" "p"', mark=" "),
     "commas in quoted names": text(T_US, P, head='"t_us","polarity, 0 or 1"'),
-    "bars": text(T_US, P, head="t|p", mark="|"),
     "a spreadsheet's hint": "sep=;\n" + text(T_US, P, head="t;p", mark=";"),
     "a title": "LED 1, 30 m\n\n" + text(T_US, P, head="t,p"),
-    "a title and no names": "LED 1\n" + text(T_US, P),
     "a line of units": text(T_US * 1e-3, P, head="time,polarity\n[ms],[0/1]", form="%.3f"),
 }
 PLACED = {
     "x,y,p,t without a header": text(X, Y, P, T_US),
     "behind %geometry": "%geometry:1280,720\n" + text(X, Y, P, T_US),
     "the sensor's size": "1280 720\n" + text(T_US, X, Y, P, mark=" "),
-    "a quoted header": text(T_US, X, Y, P, head='"t_us","x","y","p"'),
     "blanks after commas": text(T_US, X, Y, P, head="t_us,x,y,p", mark=", "),
     "times with a fraction": text(T_US * 1.0, X, Y, P, head="t_us,x,y,p"),
 }
@@ -136,13 +115,10 @@ def table(order, kind=np.int64):
 LIST, ALL = {"t": T_US, "p": P}, {"t": T_US, "x": X, "y": Y, "p": P}
 ARRAYS = {
     "a list": LIST,
-    "a list of smaller types": {"t": T_US.astype(np.uint32), "p": P > 0},
     "a list in seconds": {"event_t": T_S, "event": P * 2.0 - 1.0},
     "a list in nanoseconds": {"t_ns": T_US * 1000, "p": SIGNS.astype(np.int8)},
-    "a list in milliseconds": {"time": T_US * 1e-3, "polarity": P},
     "where the pixels are": {**LIST, "x": np.array(5), "y": np.array(6)},
     "arrays": ALL,
-    "as floats": {"timestamp": T_US * 1.0, "polarity": P * 1.0, "x": X, "y": Y},
     "big-endian": {name: column.astype(">i8") for name, column in ALL.items()},
     "seconds": {**ALL, "t": T_S},
     "nanoseconds": {**ALL, "t": T_US * 1000},
@@ -150,7 +126,6 @@ ARRAYS = {
     "polarity 255 for -1": {**ALL, "p": SIGNS.astype(np.uint8)},
     "polarity 0 and 255": {**ALL, "p": 255 * P},
     "our names": {"t_us": T_US * 1.0, "x": X, "y": Y, "p": SIGNS},
-    "our names, polarity 1 and 2": {"t_us": T_US, "x": X, "y": Y, "p": P + 1.0},
 }
 LIST_TABLES = {
     "t p": table("sp", float),
@@ -195,13 +170,6 @@ def test_two_arrays_without_names(tmp_path):
     # As SciPy gives those of MATLAB: rows and columns of one.
     np.savez(tmp_path / "b.npz", allow_pickle=False, event_t=T_S[:, None], event=SIGNS[None])
     expect(tmp_path / "b.npz", placed=False)
-
-
-def test_beside_a_table_stands_what_is_none(tmp_path):
-    info, wide = np.array({"a": 1}, dtype=object), np.zeros((100, 4000), np.uint8)
-    for other in (info, wide, np.zeros((90, 60), order="F")):
-        np.savez(tmp_path / "a.npz", events=table("txyp"), img=other)
-        expect(tmp_path / "a.npz", placed=True)
 
 
 @pytest.mark.parametrize("on_its_side", [False, True])
@@ -256,20 +224,6 @@ def test_rounded_times_are_said(digits, words, tmp_path):
         assert source.step_us == 10 ** (6 - digits)
 
 
-@pytest.mark.parametrize("suffix", ["csv", "npz"])
-def test_whole_milliseconds_of_many_pixels(suffix, tmp_path):
-    """More a second than any sensor gives, if they were microseconds."""
-    t_ms, columns = np.sort(np.random.default_rng(3).integers(0, 8, 80_000)), {"x": X, "y": Y, "p": P}
-    columns = {"t": t_ms} | {name: np.resize(column, 80_000) for name, column in columns.items()}
-    if suffix == "csv":
-        (tmp_path / "a.csv").write_text(text(*columns.values(), head="t,x,y,p"))
-    else:
-        write_npz(tmp_path / "a.npz", columns)
-    with open_source(tmp_path / f"a.{suffix}") as source:
-        assert source.header["step"] == "times are rounded to 1 ms"
-        assert "in ms, guessed" in source.header["time"]
-
-
 def test_times_coarser_than_a_chip_are_warned_of(tmp_path, evlcp):
     (tmp_path / "a.csv").write_text(text(T_S, X, Y, P, head="t_s,x,y,p", form="%.3f"))
     done = evlcp("receive", tmp_path / "a.csv", "-o", tmp_path / "out")
@@ -308,26 +262,6 @@ def test_counters_go_round(end, before_us, tmp_path):
         np.testing.assert_array_equal(got.x, columns["x"])
         assert source.counts["times_gone_round"] == 1
         assert source.guessed.endswith("the counter of times went round")
-
-
-def test_a_clock_that_restarts_at_a_piece_has_not_gone_round(tmp_path):
-    """However much was counted before: a counter of 24 bits never had that."""
-    n = PIECE_ROWS
-    t = np.concatenate([3_000_000_000 + 100 * np.arange(n), 100 * np.arange(n)])
-    np.savez(tmp_path / "a.npz", t_us=t, x=t % 640, y=t % 480, p=np.arange(2 * n) & 1)
-    with open_source(tmp_path / "a.npz") as source:
-        np.testing.assert_array_equal(source.read()[0].t_us, t)
-    assert "times_gone_round" not in source.counts
-
-
-def test_late_rows_are_sorted_in(tmp_path):
-    order = np.argsort(T_US + np.random.default_rng(3).integers(0, 5000, N), kind="stable")
-    late = {"t_us": T_US[order], "x": X[order], "y": Y[order], "p": P[order]}
-    write_npz(tmp_path / "a.npz", late)
-    write_hdf5(tmp_path / "a.h5", late)
-    (tmp_path / "a.csv").write_text(text(*late.values(), head="t_us,x,y,p"))
-    for name in ("a.npz", "a.h5", "a.csv"):
-        assert expect(tmp_path / name, placed=True).counts["rows_out_of_order"] > 1000
 
 
 def test_rows_that_are_no_number_are_dropped_and_counted(tmp_path, evlcp):

@@ -1,6 +1,5 @@
 """A replay gives out a recording at its own pace, changed in nothing else."""
 
-import numpy as np
 import pytest
 
 from evlcp_sdk.io import ReplaySource, open_source, write_events
@@ -44,16 +43,3 @@ def test_each_slice_comes_when_its_time_is_over(recording):
         (9000, [9000], []),
         (12_000, [], [12_000]),
     ]
-
-
-def test_any_slices_give_the_same_events(recording):
-    clock = Clock()
-    for slice_us in (1, 300, 100_000):
-        for max_events in (1, 4):
-            with ReplaySource(
-                open_source(recording), slice_us=slice_us, clock=clock, sleep=clock.sleep
-            ) as source:
-                pieces = list(source.stream(max_events))
-            events = Events.concat(e for e, _ in pieces)
-            assert events.x.tolist() == list(range(6))
-            assert np.concatenate([g.channel for _, g in pieces]).tolist() == [1, 2, 3]

@@ -117,13 +117,10 @@ def test_a_read_ends_when_the_source_is_closed(recording):
     [
         ("tcp://localhost:1", "Connection refused; expected a program that sends there"),
         ("tcp://localhost", "expected tcp://HOST:PORT"),
-        ("tcp:localhost:99", "expected tcp://HOST:PORT"),
         ("udp://localhost:99999", "expected udp://HOST:PORT"),
-        ("udp://localhost:0", "expected udp://HOST:PORT"),
         ("udp://192.0.2.1:5600", "expected an address of this machine"),
         ("unix:/no/such", "expected a socket that a program listens on"),
         ("tcp://localhost:1?evt=4", "evt = '4': expected 2 or 3"),
-        ("tcp://localhost:1?size=big", "size = 'big': expected WIDTHxHEIGHT"),
     ],
 )
 def test_what_is_wrong_with_a_stream_is_said(url, told):

@@ -67,20 +67,11 @@ def npy(header, data=bytes(16)):
 
 BAD_NPZ = {
     "empty": (b"", "found no NPZ file, expected one"),
-    "cut": (npz()[:-300], "found no NPZ file, expected one"),
     "a column missing": (npz(p=None), "found the arrays t_us, x, y, expected t and p"),
     "floats": (npz(x=[1.5, 2.0]), "row 1: place 1.5, expected whole numbers from 0 to 65535"),
     "objects": (npz(x=[None, 1]), r"array x: found no array of numbers \(.* objects"),
-    "two dimensions": (npz(x=[[1, 2], [3, 4]]), r"array x: found int64 \(2, 2\), expected numbers"),
-    "unequal lengths": (npz(y=[1]), "'y': 1.*expected one length"),
-    "x too large": (npz(x=[1, 70_000]), "row 2: place 70000, expected whole numbers from 0 to 65535"),
     "polarity": (npz(p=[1, 7]), "row 2: polarity 7 beside 1, expected 0 and 1, or -1 and 1"),
     "a huge time": (npz(t_us=np.array([1, 1 << 63], np.uint64)), r"row 2: time 9\.22\d*e\+18 us, expected"),
-    "bad width": (npz(width="wide"), "array width: found <U4"),
-    "unequal triggers": (
-        npz(trigger_t_us=[1], trigger_channel=[1, 2], trigger_value=[0]),
-        "'trigger_channel': 2",
-    ),
     "no trigger channels": (npz(trigger_t_us=[1]), "found the arrays p, t_us, trigger_t_us, x, y, expected"),
     "a flipped byte": (npz().replace(b"\x03\x00\x00\x00\x00", b"\x03\x00\x01\x00\x00", 1), "Bad CRC-32"),
     "a header of code": (
@@ -95,34 +86,22 @@ BAD_NPZ = {
         npz(t_us=npy(b"{'descr': '|O', 'fortran_order': False, 'shape': (2,)}\n")),
         r"array t_us: found no array of numbers \(.* objects",
     ),
-    "no NPY in it": (
-        npz(t_us=b"1, 2", x=None, y=None, p=None),
-        r"array t_us: found no array of numbers \(EOF",
-    ),
 }
 
 
 HEAD = b"t_us,x,y,p\n"
 TEN_THOUSAND = b"".join(b"%d,1,1,1\n" % t for t in range(10_000))
 BAD_CSV = {
-    "empty": (b"", r"line 1: found '', expected the columns t and p"),
     "another header": (b"t,x,y,on air\n1,2,3,1\n", r"line 1: found 't,x,y,on air', expected the columns"),
     "a column missing": (HEAD + b"1,2,3\n", "line 2: found '1,2,3', expected a time and a polarity, x and y"),
-    "a cell missing": (b"t,p\n1,1\n\n3\n", "line 4: found '3', expected a time and a polarity"),
     "a word": (HEAD + b"1,2,3,1\n\n1,two,3,1\n", "line 4: found '1,two,3,1', expected"),
-    "only a sign": (HEAD + b"-\n", "line 2: found '-', expected"),
-    "a negative x": (HEAD + b"1,-2,3,1\n", "line 2: place -2, expected whole numbers from 0 to 65535"),
     "x too large": (HEAD + b"1,1,1,1\n1,65536,3,1\n", "line 3: place 65536, expected whole numbers from 0"),
     "polarity": (HEAD + b"1,2,3,7\n", "line 2: polarity 7, expected 0 and 1, or -1 and 1, 1 and 2, 0"),
-    "polarity 5": (b"t,p\n1,1\n2,5\n", "line 3: polarity 5 beside 1, expected 0 and 1"),
     "polarity 0": (b"t,p\n1,1\n2,-1\n3,0\n4,0\n", "line 4: polarity 0 beside -1 and 1, expected 0 and 1"),
     "polarity in a word": (b"t,p\n1,1\n2,up\n3,aside\n4,1\n", "line 4: polarity 'aside', expected 0 or 1,"),
     "a number without end": (HEAD + b"9" * 30 + b",2,3,1\n", r"line 2: time 1e\+30 us, expected a number"),
-    "a time beyond": (b"t_s,p\n99999999999999999,1\n", "line 2: time 9{17} s, expected a number up to"),
     "a line without end": (HEAD + b"1" * 3_000_000 + b"\n", "line 2: found '1{60}\\.\\.\\.', expected"),
     "nothing but such a line": (b"1" * 9_000_000, "line 1: found '1{60}\\.\\.\\.', expected the columns"),
-    "bytes": (HEAD + b"\xff\xfe\n", "line 2: found '.*', expected"),
-    "damaged gzip": (b"\x1f\x8bnothing", "damaged or closed file"),
     "cut gzip": (gzip.compress(HEAD + TEN_THOUSAND)[:10_000], r"bad\.csv: damaged or closed file"),
 }
 

@@ -7,8 +7,6 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-Arrays = dict[str, np.ndarray]
-
 
 def records(**columns):
     return np.rec.fromarrays(list(columns.values()), names=list(columns))
@@ -56,8 +54,6 @@ def write_mat_73(path, arrays):
         raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64")
 
 
-Packet = tuple[int, bytes]
-"""Its number, and words."""
 KIND = "event_camera_msgs/msg/EventPacket"
 DEFINITION = (
     "Header header\nuint32 height\nuint32 width\nuint64 seq\nuint64 time_base\nstring encoding\n"

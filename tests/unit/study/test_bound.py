@@ -108,15 +108,6 @@ def test_statistics_come_from_the_frames(distance_m: float, how: dict[str, float
         assert np.std([one.distance_m for one in found]) == pytest.approx(wanted, rel=0.33)
 
 
-def test_boundaries_between_pixels_that_are_sharp_say_nothing() -> None:
-    spacing_px = 8.0
-    where = {"distance_m": LINK.camera.focal_px * 0.06 / spacing_px, "noise": 0.1}
-    assert bound(blur_px=0.003, **where) == np.inf
-    assert bound(blur_px=0.3, **where) < np.inf
-    # Where they fall on pixels, those see them.
-    assert bound(blur_px=0.1, shift_px=0.5, **where) < np.inf
-
-
 @pytest.mark.parametrize("how", [{"upside_down": True}, {"across": True}, {"dark": (5,)}], ids=str)
 def test_any_way_that_a_bar_lies(how: dict[str, bool]) -> None:
     measure = frame_bound(LINK, full_events=FULL)

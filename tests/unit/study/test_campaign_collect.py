@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -92,20 +91,6 @@ def test_a_worker_that_dies_is_replaced(tmp_path: Path) -> None:
     progress, totals = collected(plan, tmp_path / "a.sqlite", Processes(2))
     assert not progress.faults
     assert totals == collected(fake_plan(seeds=1), tmp_path / "b.sqlite")[1]
-
-
-def die_soon(job: int) -> int:
-    threading.Timer(0.1, os._exit, [1]).start()
-    return job
-
-
-def test_a_worker_that_dies_idle_is_replaced() -> None:
-    def jobs() -> Iterator[int]:
-        yield 1
-        time.sleep(0.5)
-        yield 2
-
-    assert [outcome.value for outcome in Processes(1).run(die_soon, jobs())] == [1, 2]
 
 
 def test_a_job_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
@@ -293,14 +278,3 @@ def test_ctrl_c_and_its_like_end_all_of_them(demo_raw, tmp_path, number, tell) -
     assert 2 <= len(folders) < 40
     for folder in folders:
         assert {p.name for p in folder.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
-
-
-def test_a_program_that_leaves_its_processes_ends() -> None:
-    """When the jobs under way are done; nobody closes the outcomes."""
-    code = """import time
-from evlcp_sdk.study.jobs import Processes
-if __name__ == "__main__":
-    outcomes = Processes(2).run(time.sleep, [0.01, 1, 1])
-    next(outcomes)
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=30)

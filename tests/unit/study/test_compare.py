@@ -13,7 +13,7 @@ from markupsafe import Markup, escape
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.study.collect import collect
-from evlcp_sdk.study.compare import _Watch, load_variants
+from evlcp_sdk.study.compare import load_variants
 from evlcp_sdk.study.comparison import (
     BOUND_NAME,
     COLUMNS,
@@ -191,15 +191,6 @@ def test_variants_share_what_is_set_for_all() -> None:
     with pytest.raises(ConfigError) as fault:
         load_variants(["a:", "b:ranging.id=poc"], overrides=["bar.rows=x"])
     assert str(fault.value).startswith('--variant a: bar.rows = "x": expected')
-
-
-def test_time_counts_of_frames_only() -> None:
-    watch = _Watch()
-    for stage in ("separation", "separation", "decoding", "ranging", "frame", "regions"):
-        watch.evlcp_stage_finished(stage, None, 1e-9)
-    assert {stage: len(us) for stage, us in watch.stage_us.items()} == dict.fromkeys(STAGES, 1)
-    # The wall's clock is the upper limit: a nanosecond each.
-    assert watch.frame_us == [pytest.approx(3e-3)]
 
 
 def test_a_campaign_is_a_table_a_scene(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evlcp_wh.pilots import WhPilots
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import chips_of_values, hadamard
@@ -156,21 +155,6 @@ def test_any_layout_is_received_and_measured(settings, least, lost, rmse_m) -> N
     assert found.bit_errors == 0
     assert lost or found.erased == 0
     assert not found.ranged or found.rmse_m < rmse_m
-
-
-def test_a_preamble_of_longer_chips_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By night it correlates by .35: late events come in chips without an edge, and say nothing."""
-
-    @dataclass(frozen=True)
-    class Slow(WhPilots):
-        def preamble(self) -> NDArray[np.uint8]:
-            return np.repeat(super().preamble(), 3)
-
-    monkeypatch.setattr("evlcp_wh.pilots.WhPilots", Slow)
-    scene = load_scene("night", ["duration_s=0.1", 'link.pilots.id="wh"'])
-    found = received(scene)
-    assert found.frames_found == found.frames_sent > 20
-    assert found.bit_errors == 0
 
 
 def received(scene: Scene) -> Tally:

@@ -71,9 +71,7 @@ def test_from_a_file_to_figures(evlcp, campaign: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "told"),
     [
-        (["scene.motion.distence_m=3"], "motion.distence_m = 3: unknown key; did you mean 'distance_m'?"),
         (["scene.bars.z_m=-100"], "the bar is behind the camera"),
-        (["link.ranging.id=pco"], "no ranging algorithm named 'pco'; did you mean 'poc'?"),
         (["seeds=0"], "--set seeds=0: expected campaign.KEY="),
     ],
 )
