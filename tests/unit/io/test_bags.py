@@ -193,6 +193,7 @@ def test_a_command_that_converts_says_what_is_wrong(tmp_path, evlcp):
         ([npz, "-o", raw], 0, f"{raw}: 1,200 events, 0 triggers\n"),
         ([raw, "-o", tmp_path / "a.txt"], 1, "suffix '.txt', expected .raw, .npz, .csv"),
         ([npz, "-o", raw, "--size", "9"], 2, "'9': expected WIDTHxHEIGHT"),
+        ([cut, "-o", raw], 1, "expected a width and a height for EVT3"),
         ([tmp_path / "none.raw", "-o", raw], 3, "none.raw: No such file"),
         ([cut, "--size", "1280x720", "-o", tmp_path / "cut.raw"], 3, "line 3"),
     ):
@@ -218,6 +219,7 @@ def test_what_is_wrong_with_hdf5_is_said(tmp_path):
     for name, told in (
         ("other.h5", "found images, other, expected /events or /raw_events or /CD/events"),
         ("table.h5", "say which columns they are, as by hdf5:PATH?columns=txyp"),
+        ("table.h5?columns=txy", "columns = 'txy': expected the letters t, x, y and p"),
         ("ecf.h5", "compressed by ECF, Prophesee's own codec"),
     ):
         with pytest.raises(InputError, match=re.escape(told)):
