@@ -1,6 +1,7 @@
 """What tests of live runs share."""
 
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -32,6 +33,12 @@ def key(frame: Frame) -> tuple[Any, ...]:
     """What is the same of a frame however it was received."""
     symbols, distance = frame.soft.symbols.tolist(), repr(frame.range.distance_m)
     return frame.transmitter, frame.packet, frame.frame, frame.t_us, symbols, distance
+
+
+def dies(link: socket.socket) -> None:
+    """A connection is not ended, but broken off (RST), as by a process that is killed."""
+    link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    link.close()
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import socket
 import subprocess
 import sys
 import threading
@@ -26,7 +27,7 @@ from evlcp_sdk.run import live, receive
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events
 from evlcp_sdk.utc import PulseClock
 from evlcp_sdk.values import Events, Triggers
-from tests.unit.live.helpers import PATIENT, key
+from tests.unit.live.helpers import PATIENT, dies, key, sender
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
 
@@ -199,6 +200,24 @@ def test_a_damaged_recording_is_not_waited_for(demo_raw: Path, tmp_path: Path) -
     assert 0 < waited_us < 10e6
     assert "pace" in [note["code"] for note in summary["notes"]]
     assert [key(f) for f in gathered(mine)["frame"]] == [key(f) for p in receive(damaged) for f in p.frames]
+
+
+def test_who_sends_may_die_at_any_moment(demo_raw: Path, tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    """Half a recording, and half a word, are received; where the connection broke is said in one line."""
+    data = demo_raw.read_bytes()
+    data = data[: len(data) // 2 | 1]
+    (tmp_path / "half.raw").write_bytes(data)
+    assert evlcp("receive", tmp_path / "half.raw", "-o", tmp_path / "file").code == 0
+    want = (tmp_path / "file" / "frames.csv").read_text()
+    assert want.count("\n") > 4
+    for end, status, code in ((socket.socket.close, "complete", 0), (dies, "failed", 3)):
+        with sender([data], end) as url:
+            done = evlcp("live", url, "--waiting-ms", "100000", "--json", "-o", tmp_path / status)
+        summary = json.loads(done.out)
+        assert (done.code, summary["status"]) == (code, status), done.err
+        assert summary["counts"]["frames"] == want.count("\n") - 1
+        assert (tmp_path / status / "frames.csv").read_text() == want
+    assert len(done.err.strip().splitlines()) == 1
 
 
 def test_the_command(evlcp: Callable[..., Any], demo_raw: Path) -> None:
