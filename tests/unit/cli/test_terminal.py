@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from evlcp_sdk.cli import _common
-from evlcp_sdk.cli._common import bytes_bar, log_on_stderr
+from evlcp_sdk.cli._common import log_on_stderr
 from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.io import write_events
 from evlcp_sdk.printable import printable
@@ -90,18 +89,6 @@ def test_the_log_is_said_on_stderr(capsys: pytest.CaptureFixture[str]) -> None:
     assert (said.out, said.err) == ("", "evlcp: compiling\\x1b\n")
 
 
-def test_a_bar_says_how_much_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    # A dumb terminal has no bars.
-    monkeypatch.setenv("TERM", "xterm")
-    said = StringIO()
-    screen = Console(file=said, force_terminal=True, width=80)
-    monkeypatch.setattr(_common, "shows_bars", lambda: True)
-    monkeypatch.setattr(_common, "console", lambda stderr: screen)
-    with bytes_bar("night.raw") as advance:
-        advance(1_000_000, 4_000_000)
-    assert "1.0/4.0 MB" in said.getvalue()
-
-
 def table_of(head: list[str], rows: list[list[str]], names: int = 1, **screen: Any) -> str:
     """A table as it is shown, without its colours."""
     out = StringIO()
@@ -119,14 +106,3 @@ def test_all_columns_are_there_and_each_part_says_of_what(width: int, terminal: 
     assert told.count("one bar 1") == parts + 1  # "one bar 10" begins so, too.
     assert told.count("one bar 0") == parts
     assert not terminal or max(map(len, told.splitlines())) <= width
-
-
-def test_a_name_longer_than_the_screen_cuts_no_figure() -> None:
-    name = "".join(chr(97 + i % 26) for i in range(60))
-    rows = [[name, "288 of 288", "2.58"]]
-    told = table_of(["series", "positions", "NEES"], rows, width=40, force_terminal=True)
-    assert "288 of 288" in told
-    assert "2.58" in told
-    first = told[: told.index("NEES")]
-    assert "".join(re.findall(r"^[a-z]+(?= |$)", first, re.M)).replace("series", "") == name
-    assert max(map(len, told.splitlines())) <= 40

@@ -83,8 +83,6 @@ def readout_of(t_us: NDArray[np.int64], y: NDArray[np.int64] | int = 0, pieces: 
         (FOUND, {"frames": 60, "frames_askew": 40}, "40 of 60 frames show bars that do not stand plumb"),
         # Of bars that one controller feeds: symbols are symbols, unless messages or positions are asked for.
         (FOUND, {"frames": 60, "frames_alike": 60}, ""),
-        # One bar of three that is mounted so.
-        (FOUND, {"frames": 60, "frames_askew": 20}, ""),
         (FOUND, {"frames": 60, "frames_inverted": 50}, "50 of 60 frames fit only a light that is on where"),
         (FOUND, {"frames": 60, "frames_inverted": 20}, ""),
         # Of a bar that another link reads.
@@ -100,14 +98,11 @@ def readout_of(t_us: NDArray[np.int64], y: NDArray[np.int64] | int = 0, pieces: 
             {"frames": 60, "dropped_crowded": 7, "frames_cut": 3, "steps_forgotten": 50},
             "more than the receiver holds at a time: 7 events of crowded time steps dropped; 3 frames",
         ),
-        (FOUND, {"frames": 60, "steps_forgotten": 50, "areas_left_out": 9}, ""),
         (NOTHING, BLINKS | {"preambles": 0}, f"{BLINKING} preamble is"),
         (NOTHING, BLINKS | {"preambles": 1}, ""),
         (NOTHING, {"events_in_regions": 20_000, "regions_opened": 3, "preambles": 0}, ""),
         # Of a framing that has no preamble.
         (NOTHING, BLINKS | {"frames": 0}, f"{BLINKING} frame is"),
-        (NOTHING, BLINKS | {"frames": 2}, ""),
-        (NOTHING, {"events": 1000, "dropped_backward": 90}, ""),
         (NOTHING, {"events": 1_000_000, "dropped_backward": 900}, ""),
         (
             NOTHING,
@@ -128,7 +123,6 @@ def readout_of(t_us: NDArray[np.int64], y: NDArray[np.int64] | int = 0, pieces: 
         (tally_of(HIDDEN), {}, "transmitter 0: clusters never seen: 4, 12: "),
         (tally_of(RANDOM, points_px=AT_50_M), {}, ""),
         (tally_of(RANDOM, points_px=400 + (AT_50_M - 400) * 0.8), {}, "its distances are 20% too short for"),
-        (tally_of(RANDOM, points_px=400 + (AT_50_M - 400) * 1.5), {}, "50% too long"),
         (tally_of(RANDOM, points_px=LYING), {}, ""),
         (tally_of(RANDOM, points_px=HEAD_DOWN), {}, "its clusters stand the other way round"),
         # What is known to be a reflection may be anything; in a wet road it stands on its head.
@@ -288,17 +282,6 @@ def test_a_sensor_that_comes_to_each_row_too_late(rows: int, rests: bool) -> Non
     assert all("1 us a row" in text and "chips: changes" in text for text in late)
 
 
-def test_a_readout_at_its_limit() -> None:
-    """3000 events in each millisecond, against 3000 on average, and a lamp that blinks evenly."""
-    rng = np.random.default_rng(4)
-    others = rng.poisson(3000, 300), rng.poisson(20, 300), np.full(300, 20)
-    for many, capped in ((np.full(300, 3000), True), *((other, False) for other in others)):
-        t_us = np.sort(np.concatenate([1000 * i + rng.integers(0, 1000, n) for i, n in enumerate(many)]))
-        found = find(Facts(LINK, NOTHING, {}, 0.0, 3e5, readout=readout_of(t_us)))
-        assert [doubt.code for doubt in found] == ["saturated"] * capped
-        assert not capped or "hold 3 Mev/s" in found[0].text
-
-
 @given(st.lists(st.integers(0, 3_000), min_size=1, max_size=300), st.integers(1, 9))
 def test_events_of_each_millisecond(steps: list[int], pieces: int) -> None:
     """Against NumPy's count of the milliseconds that are over."""
@@ -334,17 +317,14 @@ def known(strange: list[int], unseen: list[int]) -> dict[str, Any]:
     ("code", "positions", "said"),
     [
         ("no-site", NO_SITE, "received: ids 7, 9: compare"),
-        ("no-site", NO_SITE | {"heard": {}}, "received: no id: compare"),
         # A bar more beside those that are known is none.
         ("no-site", NO_SITE | {"fixes": 9}, ""),
         ("unknown-id", known([107], [8]), "without id 107, received and in no site; id 8 of the sites"),
         ("unknown-id", known([9, 4], [1, 2]), "without ids 4, 9, received and in no site; ids 1, 2 of the"),
-        ("unknown-id", known([9], [*range(20, 40)]), "ids 20, 21, 22, 23, 24 and 15 more of the sites"),
         ("unknown-id", known([107], []), ""),
         ("unknown-id", known([], [8]), ""),
         ("misfit", misfit({"heading": 9, "bar 1": 2}), "another heading would explain it: compare"),
         ("misfit", misfit({"focal length": 10, "bar 0": 6}, 34.6), "another focal length or another bar 0"),
-        ("misfit", misfit({"bar 0": 4}), "contradict one another: compare sites, angles and [camera]"),
         (
             "misfit",
             misfit({"bar 0": 10}, 51.2),
@@ -353,7 +333,6 @@ def known(strange: list[int], unseen: list[int]) -> dict[str, Any]:
         ),
         ("focal", learnt("camera", "focal_mm", 0.1, 0.02), "a focal length of 35.1 +- 0.02 mm, not 35"),
         ("focal", learnt("camera", "focal_mm", 0.05, 0.02), ""),
-        ("focal", learnt("camera", "focal_mm", 0.1, 0.199), ""),
         ("learnt", learnt("bar 2", "east_m", 0.4, 0.02), ""),
         ("learnt", learnt("bar 2", "east_m", -0.9, 0.02), "shows bar 2, east_m, -0.9 off what is stated,"),
     ],
@@ -362,12 +341,3 @@ def test_what_positions_say(code: str, positions: dict[str, Any], said: str) -> 
     link = load_link(overrides=["camera_sigma.focal_mm=0.2"])
     found = find(Facts(link, NOTHING, {}, positions=NO_POSITIONS | positions))
     assert [said in str(one) for one in found if one.code == code] == [True] * bool(said)
-
-
-def test_packets_of_a_live_run_that_came_too_late_want_no_more_light() -> None:
-    tally = tally_of(np.concatenate([RANDOM, RANDOM, RANDOM]))
-    tally.transmitters[0].blocks = 2
-    for late_events, step in ((0, "more light"), (1000, "events came too late")):
-        facts = Facts(LINK, tally, READ, late_events=late_events)
-        (found,) = (one for one in find(facts) if one.code == "blocks-failed")
-        assert found.next_step.startswith(step)
