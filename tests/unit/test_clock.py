@@ -129,17 +129,6 @@ def test_a_clock_that_others_agree_on_is_believed_and_nothing_is_lost(leap_us: i
     assert [clock.camera_us(float(row[0])) for row in got] == [*one.t_us, *other.t_us]
 
 
-@pytest.mark.parametrize("leap_us", [-(10**9), LEAP_US + 1, 2**50, 2**63 - 1 - 10**12])
-@pytest.mark.parametrize("many", [1, 15])
-def test_a_clock_that_few_agree_on_costs_its_own_events(leap_us: int, many: int) -> None:
-    events = even(10**12)
-    events.t_us[700 : 700 + many] += leap_us
-    got, clock = taken(events, [705])
-    assert len(got) == len(events) - many
-    assert clock.counts["dropped_time_doubtful"] == many
-    assert clock.counts["clock_leaps"] == clock.counts["clock_restarts"] == 0
-
-
 def test_what_is_held_is_bounded() -> None:
     clock = CameraClock(WIDTH, HEIGHT)
     clock.take(even(10**12))
@@ -237,10 +226,3 @@ def test_a_part_of_a_step_comes_when_it_is_due(seed: int, cuts: list[int], dues:
             if step.start_us < due < step.start_us + STEP_US and any(t >= due for t, *_ in within):
                 want.append((step.start_us, due, [row for row in within if row[0] < due]))
     assert [(s.start_us, s.end_us, rows(s.events)) for s in given_ if not s.whole] == want
-
-
-def test_a_stream_without_events_has_no_steps() -> None:
-    off = Events.of([5, 6], [WIDTH, 0], [0, HEIGHT], [1, 1])
-    steps, timeline = steps_of(Events.concat([Events.empty(), off]), [0, 1], waits=1)
-    assert steps == []
-    assert timeline.clock.counts["events"] == timeline.clock.counts["dropped_off_sensor"] == 2

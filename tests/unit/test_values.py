@@ -3,7 +3,6 @@
 import math
 import sys
 from dataclasses import replace
-from pathlib import Path
 from xml.etree.ElementTree import fromstring
 
 import numpy as np
@@ -112,22 +111,6 @@ def test_events_as_tables() -> None:
         assert np.array_equal(table[name].to_numpy(), column)
     frame.loc[0, "x"] = 9
     assert EVENTS.x[0] == 1
-
-
-def test_frames_as_a_table(demo_raw: Path) -> None:
-    pytest.importorskip("pandas", reason="the extra pandas is not installed")
-    packets = list(evlcp.receive(demo_raw))
-    frames = [f for p in packets for f in p.frames]
-    table = evlcp.receive(demo_raw).to_pandas()
-    assert list(table.columns) == list(FRAME_COLUMNS)
-    assert table["symbols"].tolist() == [f.soft.symbols.tolist() for f in frames]
-    assert table["t_us"].tolist() == [f.t_us for f in frames]
-    assert np.array_equal(table["distance_m"], [f.range.distance_m for f in frames], equal_nan=True)
-    assert table["frame"].tolist() == [f.frame for f in frames]
-    assert table.equals(evlcp.frames_table(packets, "pandas"))
-    assert (str(table["echo_of"].dtype), table["echo_of"].notna().any()) == ("Int64", False)
-    marked = [replace(p, frames=tuple(replace(f, echo_of=3) for f in p.frames)) for p in packets]
-    assert set(evlcp.frames_table(marked, "pandas")["echo_of"]) == {3}
 
 
 def test_frames_as_arrow_with_nulls_and_the_filtered_distance() -> None:
