@@ -55,19 +55,9 @@ class Bar:
         return self.chip.drivers.dark
 
 
-@pytest.fixture(scope="module")
-def programmed(stm32):
-    """The bar that all tests share, and what sets it back."""
-    bar = Bar(stm32()[0])
-    return bar, bar.chip.snapshot()
-
-
 @pytest.fixture
-def bar(programmed):
-    bar, back = programmed
-    back()
-    bar.board = connect(bar.chip)
-    return bar
+def bar(stm32):
+    return Bar(stm32()[0])
 
 
 def test_every_start_shows_every_chip_on_every_led(bar):

@@ -118,10 +118,3 @@ def test_the_host_of_2_0_and_this_firmware():
         if old.type & ~requests.REPLY_BIT not in (requests.Type.HELLO, requests.Type.STATUS):
             assert new.payload[: len(old.payload)] == old.payload
     assert seen == {t["type"] for t in MESSAGES if t["minor"] == 0}
-
-
-LATER = requests.MINOR + 1
-
-
-def later(name, type_="u32"):
-    return {"name": name, "type": type_, "doc": "Of tomorrow.", "since": LATER}

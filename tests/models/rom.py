@@ -1,6 +1,5 @@
 """The boot loader in an STM32F405's ROM, by AN3155, on a line with its own clock: for tests of flashing."""
 
-from collections.abc import Generator
 from functools import reduce
 from operator import xor
 
@@ -10,8 +9,6 @@ _ACK, _NACK, _SYNC = 0x79, 0x1F, 0x7F
 _COMMANDS = bytes([0x00, 0x01, 0x02, 0x11, 0x21, 0x31, 0x44, 0x63, 0x73, 0x82, 0x92])
 _SECTOR_KIB = (16, 16, 16, 16, 64, 128, 128, 128, 128, 128, 128, 128)
 _OPTIONS = 0x1FFF_C000
-
-Taking = Generator[None, int, bytes]
 
 
 class RomEmulator:

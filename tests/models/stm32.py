@@ -8,7 +8,6 @@ setting that they do not know; ports, PWR, DAC and EXTI keep what is written. A 
 and `write` are what the core does to a register.
 """
 
-import copy
 import heapq
 import secrets
 import struct
@@ -31,6 +30,7 @@ UNIT_HZ = 336_000_000
 HSI_HZ, HSE_HZ, LSI_HZ = 16_000_000, 8_000_000, 32_000
 US = UNIT_HZ // 1_000_000
 LEDS = 96
+NEVER = 1 << 62
 
 RETURN = 0x1FFE0000
 """Where BX LR goes at the end of an exception: a place the part does not have."""
@@ -266,32 +266,20 @@ class Dma(Peripheral):
 
 
 class Spi(Peripheral):
-    """SPI1, master, 16 bits, and the chain of shift registers on it."""
+    """SPI1, master, 16 bits."""
 
     REGISTERS: ClassVar = {0x00: "cr1", 0x04: "cr2", 0x08: "status", 0x0C: "received"}
-    cr1 = cr2 = received = began = 0
+    cr1 = cr2 = received = 0
     buffer = word = None
-    chain = 0  # 96 bits; the one that left first is the highest
     dead = False
 
     @property
     def status(self):
         return (self.buffer is None) << 1 | (self.word is not None) << 7
 
-    def bits_done(self):
-        """Bits of the word under way that have left."""
-        if self.word is None or self.dead:
-            return 0
-        return min(16, (self.chip.now - self.began) // self.bit)
-
     @property
     def bit(self):
         return UNIT_HZ // self.chip.pclk2 * (2 << (self.cr1 >> 3 & 7))
-
-    def outputs(self):
-        """The chain as it stands, a word on its way included."""
-        done = self.bits_done()
-        return (self.chain << done | (self.word or 0) >> (16 - done)) & (1 << LEDS) - 1
 
     def write(self, offset, value):
         if offset == 0x0C:
@@ -310,16 +298,15 @@ class Spi(Peripheral):
 
     def shift(self, word):
         """A word begins to leave."""
-        self.word, self.began = word, self.chip.now
+        self.word = word
         self.chip.at(self.chip.now + 16 * self.bit, self.done)
 
     def done(self):
         """A word has left."""
         if self.dead or self.word is None:
             return
-        self.chain = (self.chain << 16 | self.word) & (1 << LEDS) - 1
+        self.chip.drivers.shift(self.word)
         self.word = None
-        self.chip.drivers.look()
         if self.buffer is not None:
             word, self.buffer = self.buffer, None
             self.shift(word)
@@ -338,13 +325,18 @@ class Shown:
 
 
 class Drivers:
-    """The latches and output enable of the LED drivers; the latch is transparent while it is high."""
+    """The LED drivers: a chain of shift registers, latches, transparent while high, and output enable."""
 
     def __init__(self, chip):
         self.chip = chip
+        self.chain = 0  # 96 bits; the one that left first is the highest
         self.latch = False
         self.held = 0
         self.log = []
+
+    def shift(self, word):
+        self.chain = (self.chain << 16 | word) & (1 << LEDS) - 1
+        self.look()
 
     @property
     def dark(self):
@@ -360,7 +352,7 @@ class Drivers:
         level = self.chip.pin(0x40020000, 6)
         closes = self.latch and not level
         if self.latch or level:
-            self.held = self.chip.spi.outputs()
+            self.held = self.chain
         self.latch = bool(level)
         last = self.log[-1] if self.log else None
         if closes or last is None or (last.row, last.dark) != (self.row, self.dark):
@@ -457,48 +449,24 @@ class Iwdg(Peripheral):
     """The independent watchdog, on the LSI (RM0090 21)."""
 
     REGISTERS: ClassVar = {0x0: "key", 0x4: "pr", 0x8: "rlr", 0xC: "busy"}
-    key = pr = busy_until = due = 0
+    key = pr = busy_until = 0
     rlr = 0xFFF
     open = on = False
-    looks_at = 1 << 62
+    due = NEVER
 
     @property
     def busy(self):
         return 3 if self.chip.now < self.busy_until else 0
-
-    @property
-    def timeout(self):
-        """How long it waits."""
-        return (self.rlr + 1) * (4 << self.pr) * UNIT_HZ // LSI_HZ
 
     def write(self, offset, value):
         if offset == 0x0:
             self.open = value == 0x5555
             self.on |= value == 0xCCCC
             if value in (0xAAAA, 0xCCCC) and self.on:
-                self.feed()
+                self.due = self.chip.now + (self.rlr + 1) * (4 << self.pr) * UNIT_HZ // LSI_HZ
         elif self.open:
             self.busy_until = self.chip.now + 5 * UNIT_HZ // LSI_HZ
             super().write(offset, value)
-
-    def feed(self):
-        """Begin anew."""
-        self.due = self.chip.now + self.timeout
-        if self.due < self.looks_at:
-            self._look_at(self.due)
-
-    def _look_at(self, time):
-        """Look then whether it bites: it is fed much more often than it could."""
-        self.looks_at = time
-        self.later(time, lambda: self._look(time))
-
-    def _look(self, time):
-        if self.looks_at != time:
-            return
-        if self.chip.now >= self.due:
-            self.chip.reset(RESET_BY_IWDG)
-        else:
-            self._look_at(self.due)
 
 
 class Flash(Peripheral):
@@ -530,29 +498,6 @@ class Flash(Peripheral):
                 self.chip.now += UNIT_HZ
                 self.stale = bool(self.acr & 0x600)
                 self.cr &= ~0x10000
-
-
-class Rng(Peripheral):
-    """Random numbers, a word in 40 cycles of the PLL's 48 MHz (RM0090 24)."""
-
-    WORD = 40 * UNIT_HZ // 48_000_000
-
-    control = ready = 0
-
-    def read(self, offset):
-        clocked = self.chip.plain.get(0x40023834, 0) >> 6 & 1 and self.chip.plain[0x40023800] >> 25 & 1
-        on = clocked and self.control >> 2 & 1
-        if offset == 0x4:
-            return int(bool(on) and self.chip.now >= self.ready)
-        if offset == 0x8 and on and self.chip.now >= self.ready:
-            self.ready = self.chip.now + self.WORD
-            return int.from_bytes(secrets.token_bytes(4), "little")
-        return self.control if offset == 0x0 else 0
-
-    def write(self, offset, value):
-        if offset == 0x0:
-            self.control = value
-            self.ready = self.chip.now + self.WORD
 
 
 def numbers(offset, value):
@@ -592,13 +537,13 @@ class Stm32:
         self.order = count()
         self.resets = []
         self.hse_works = True
+        self.drivers = Drivers(self)
         self.reset(RESET_BY_PIN)
 
     # -- clocks and reset
 
     def reset(self, cause):
         """All but RAM, flash and the log of the LEDs begins anew."""
-        before = vars(self).get("drivers"), vars(self).get("spi")
         self.resets.append(cause)
         self.events.clear()
         self.plain = {0x40023800: 0x83, 0x40023874: cause, 0x40023804: 0x24003010}
@@ -616,10 +561,7 @@ class Stm32:
         self.tim3.on_edge = lambda _: self.drivers.look()
         self.dma, self.spi, self.usart = Dma(self), Spi(self), Usart(self)
         self.systick, self.iwdg, self.flash = SysTick(self), Iwdg(self), Flash(self)
-        self.drivers = Drivers(self)
-        if before[0]:
-            self.drivers.log, self.drivers.held = before[0].log, before[0].held
-            self.spi.chain = before[1].chain
+        self.drivers.latch = False
         self.places = {
             0x40000000: self.tim2,
             0x40000400: self.tim3,
@@ -629,56 +571,20 @@ class Stm32:
             0x40013000: self.spi,
             0x40023C00: self.flash,
             0x40026400: self.dma,
-            0x50060800: Rng(self),
         }
         stack, entry = struct.unpack("<2I", self.uc.mem_read(0x08000000, 8))
         self.uc.reg_write(arm_const.UC_ARM_REG_SP, stack)
         self.pc = entry & ~1
         self.drivers.look()
 
-    def snapshot(self):
-        """What sets the part, its memories and the log of its LEDs back to now, as often as it is called."""
-
-        def copied(state):
-            kinds = (dict, list, set, bytearray)
-            return {k: copy.copy(v) if isinstance(v, kinds) else v for k, v in state.items()}
-
-        # events refer to these very objects
-        things = [self, *self.places.values(), self.systick, self.drivers]
-        states = [copied(vars(thing)) for thing in things]
-        registers = self.uc.context_save()
-        pieces = [(0x20000000, 1 << 17), *((0x08000000 + (n << 17), 1 << 17) for n in range(8))]
-        memories = [(at, bytes(self.uc.mem_read(at, size))) for at, size in pieces]
-
-        def back():
-            for thing, state in zip(things, states, strict=True):
-                vars(thing).clear()
-                vars(thing).update(copied(state))
-            self.uc.context_restore(registers)
-            for at, memory in memories:
-                # code that is written is translated anew
-                if self.uc.mem_read(at, len(memory)) != memory:
-                    self.uc.mem_write(at, memory)
-
-        return back
-
     @property
     def stack(self):
         return int(self.uc.reg_read(arm_const.UC_ARM_REG_SP))
 
-    def bus_shift(self, place):
-        """By how many bits the clock of APB1 (10) or APB2 (13) is divided."""
-        divider = self.plain.get(0x40023808, 0) >> place & 7
-        return divider - 3 if divider & 4 else 0
-
     @property
     def pclk2(self):
-        """Clock of APB2, Hz."""
-        return UNIT_HZ // self.cycle >> self.bus_shift(13)
-
-    def timer_unit(self, name):
-        """Time of a count: timers get twice the bus clock if that is divided (RM0090 7.2)."""
-        return self.cycle << max(0, self.bus_shift(13 if name == "TIM1" else 10) - 1)
+        """Clock of APB2, Hz: half of the core's, but the whole of 16 MHz."""
+        return HSI_HZ if self.cycle == UNIT_HZ // HSI_HZ else 84_000_000
 
     def _rcc_write(self, offset, value):
         at = 0x40023800 + offset
@@ -687,29 +593,25 @@ class Stm32:
             pll = bool(value & 1 << 24 and hse)
             value = value & ~(1 << 17 | 1 << 25) | hse << 17 | pll << 25
         elif offset == 0x08:
-            assert value & 3 in (0, 2), value
-            if value & 3 == 2:
+            fast = value == 5 << 10 | 4 << 13 | 2
+            assert fast or not value & 3, hex(value)
+            if fast:
                 m = self.hse_hz // 1_000_000
-                assert self.plain[0x40023804] == 7 << 24 | 1 << 22 | 336 << 6 | m, (
-                    "not 168 MHz by this crystal"
-                )
+                pll = 7 << 24 | 1 << 22 | 336 << 6 | m
+                assert self.plain[0x40023804] == pll, "not 168 MHz by this crystal"
                 assert self.flash.acr & 7 == 5
-            self._core_cycle(UNIT_HZ // (168_000_000 if value & 3 == 2 else HSI_HZ), value)
+            self._core_cycle(2 if fast else UNIT_HZ // HSI_HZ)
             value |= (value & 3) << 2
-        elif offset == 0x0C:
-            value = self.plain.get(at, 0) & ~0x80 if value & 1 << 23 else self.plain.get(at, 0)
-        elif offset == 0x74:
-            value = self.plain[at] & (0 if value & 1 << 24 else 0xFFFFFFFF)
         self.plain[at] = value
 
-    def _core_cycle(self, cycle, cfgr):
+    def _core_cycle(self, cycle):
         timers = (self.tim1, self.tim2, self.tim3)
         for timer in timers:
             timer.hold(timer.counter())
         self.cycle = cycle
-        self.plain[0x40023808] = cfgr
         for timer in timers:
-            timer.unit = self.timer_unit(timer.name)
+            # TIM2 and TIM3 are on the slower bus: 84 MHz of 168
+            timer.unit = 4 if cycle == 2 and timer is not self.tim1 else cycle
             timer.plan()
         self.systick.plan()
 
@@ -729,8 +631,8 @@ class Stm32:
             return
         self.plain[0x40023800] = cr & ~(1 << 16 | 1 << 17 | 1 << 24 | 1 << 25)
         if cr & 1 << 19:
-            self._core_cycle(UNIT_HZ // HSI_HZ, self.plain[0x40023808] & ~0xF)
-            self.plain[0x4002380C] = self.plain.get(0x4002380C, 0) | 0x80
+            self.plain[0x40023808] &= ~0xF
+            self._core_cycle(UNIT_HZ // HSI_HZ)
             self.pending.add(2)
         else:
             for timer in (self.tim1, self.tim2, self.tim3):
@@ -765,13 +667,17 @@ class Stm32:
         at = base + offset
         if at == 0x40000024:  # by far the most frequent one
             return self.tim2.counter()
-        if size != 4:
-            raise AssertionError(hex(at))
+        assert size == 4, hex(at)
         place = self.places.get(at & ~0x3FF)
         if place is not None:
             return int(place.read(at & 0x3FF))
         if 0xE000E010 <= at < 0xE000E020:
             return self.systick.read(at & 0xFF)
+        if at == 0x50060804:  # random numbers, by the PLL's 48 MHz
+            on = self.plain.get(0x40023834, 0) >> 6 & self.plain[0x50060800] >> 2
+            return on & self.plain[0x40023800] >> 25 & 1
+        if at == 0x50060808:
+            return int.from_bytes(secrets.token_bytes(4), "little")
         if at == 0x40020410:  # the thermal switch: closed to ground while it is cool
             pulled_up = self.plain.get(0x4002040C, 0) >> 2 & 3 == 1
             return int(self.thermal_open and pulled_up) << 1
@@ -837,9 +743,7 @@ class Stm32:
         c, uc = arm_const, self.uc
         frame = [*map(uc.reg_read, KEPT), self.pc, uc.reg_read(c.UC_ARM_REG_XPSR) | 1 << 24]
         stack = uc.reg_read(c.UC_ARM_REG_SP)
-        odd = stack >> 2 & 1
-        frame[7] |= odd << 9
-        stack -= 32 + 4 * odd
+        stack -= 32
         uc.mem_write(stack, struct.pack("<8I", *frame))
         uc.reg_write(c.UC_ARM_REG_SP, stack)
         uc.reg_write(c.UC_ARM_REG_LR, RETURN | 1)
@@ -856,8 +760,8 @@ class Stm32:
         *kept, self.pc, status = struct.unpack("<8I", uc.mem_read(stack, 32))
         for register, value in zip(KEPT, kept, strict=True):
             uc.reg_write(register, value)
-        uc.reg_write(c.UC_ARM_REG_XPSR, status & ~(1 << 9) & 0xFF000000)
-        uc.reg_write(c.UC_ARM_REG_SP, stack + 32 + 4 * (status >> 9 & 1))
+        uc.reg_write(c.UC_ARM_REG_XPSR, status & 0xFF000000)
+        uc.reg_write(c.UC_ARM_REG_SP, stack + 32)
         ended = self.active.pop()
         if self.entered:
             number, at = self.entered.pop()
@@ -872,8 +776,15 @@ class Stm32:
         """Do this then."""
         heapq.heappush(self.events, (time, next(self.order), event))
 
+    def _next(self):
+        """When something happens that the core does not do."""
+        return min(self.iwdg.due, self.events[0][0] if self.events else NEVER)
+
     def _events(self):
-        while self.events and self.events[0][0] <= self.now:
+        while self._next() <= self.now:
+            if self.iwdg.due <= self.now:
+                self.reset(RESET_BY_IWDG)
+                return
             time, _, event = heapq.heappop(self.events)
             now, self.now = self.now, time
             event()
@@ -884,18 +795,16 @@ class Stm32:
         end = self.now + round(us * US)
         while self.now < end:
             self._events()
-            until = min(end, self.events[0][0]) if self.events else end
+            until = min(end, self._next())
             if self.core_stands:
                 self.now = max(self.now, until)
                 continue
             self._take()
             instructions = max(1, min(SLICE, (until - self.now) // self.cycle))
-            resets = len(self.resets)
             self.uc.emu_start(self.pc | 1, RETURN, count=instructions)
             if self.restarts:
                 self.restarts = False
                 self.reset(RESET_BY_SOFTWARE)
-            if len(self.resets) != resets:
                 continue
             self.now += instructions * self.cycle
             before, self.pc = self.pc, self.uc.reg_read(arm_const.UC_ARM_REG_PC)
