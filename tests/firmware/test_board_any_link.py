@@ -318,73 +318,47 @@ def test_the_commands(evlcp, tmp_path, device, board):
         check_fault(evlcp("board", "leds", record, "--chips", out, *OPTIONS[4:], *other), 3, says)
 
 
-# -- characters, by the test's own encoder, and 4-PPM
+# -- characters, by the test's own encoder
 
+TEXT = b"Tempo 30!"
 LAMP = ["bar.rows=6", "bar.columns=1", "bar.cluster_rows=6", "bar.cluster_columns=1", "framing.id=uart"]
 SERIAL = [*LAMP, "framing.data_bits=7", "framing.parity=even", "framing.stop_bits=2"]
-TURNED = [*LAMP, "framing.parity=odd", "framing.idle=off", "framing.first_bit=highest"]
-PULSES = ["modulation.id=ppm", "bar.rows=48"]
 
 
-def serial_chips(text, bits, odd, stops, turned=False):
-    """Characters as a serial port sends them behind a pause of 16 bits: marks are ones.
-
-    Turned, the highest bit goes first, by an LED that is dark in pauses: a start bit lights it.
-    """
+@pytest.fixture
+def serial():
+    """A link, a packet's symbols, and its chips: 7E2 as a serial port sends it behind a pause of 16 bits."""
     chips = [1] * 16
-    for byte in text:
-        data = [byte >> k & 1 for k in range(bits)]
-        chips += [0, *data[:: -1 if turned else 1], (sum(data) + odd) % 2, *[1] * stops]
-    return [chip ^ turned for chip in chips]
+    for byte in TEXT:
+        data = [byte >> k & 1 for k in range(7)]
+        chips += [0, *data, sum(data) % 2, 1, 1]
+    link = board_link(*SERIAL, f"air.frames_per_packet={len(TEXT)}")
+    return link, np.array(list(TEXT))[:, None], np.array(chips, np.uint8)
 
 
-def packet_of(kind):
-    """A link, a packet's symbols, and the chips of its LEDs, (chips, LEDs)."""
-    if kind == "4-PPM":
-        link = board_link(*PULSES, "air.frames_per_packet=3")
-        symbols = symbols_of(1, 2, link)[0]
-        return link, symbols, np.repeat(packet_chips(symbols, link.codebook, 1), 6, axis=1)
-    text = b"Tempo 30!"
-    ports = {"7E2": (SERIAL, (7, 0, 2)), "8O1, turned": (TURNED, (8, 1, 1, True))}
-    overrides, port = ports[kind]
-    link = board_link(*overrides, f"air.frames_per_packet={len(text)}")
-    chips = np.array(serial_chips(text, *port), np.uint8)
-    return link, np.array(list(text))[:, None], np.repeat(chips[:, None], 6, axis=1)
+def test_characters_are_those_of_the_link(serial, device, board):
+    link, symbols, told = serial
+    check_plays(device, board, bank_of(symbols[None], link), np.repeat(told[:, None], 6, axis=1))
 
 
-KINDS = ["7E2", "8O1, turned", "4-PPM"]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_characters_and_pulses_are_those_of_the_link(kind, device, board):
-    link, symbols, told = packet_of(kind)
-    check_plays(device, board, bank_of(symbols[None], link), told)
-
-
-@pytest.mark.parametrize("kind", [*KINDS, "ten clusters"])
-def test_the_image_of_the_part_plays_them_too(kind, stm32):
+def test_the_image_of_the_part_plays_any_clusters_too(stm32):
     """The image as it is flashed; rows as they are latched, from the first lit one on."""
     from tests.models.stm32 import US, Dma, lit_rows
 
-    bank, told = a_bank(), EXPECTED
-    if kind in KINDS:
-        link, symbols, told = packet_of(kind)
-        bank = bank_of(symbols[None], link)
     chip, board = stm32()
     assert board.about.chip_rate_min_hz == 1282  # chips of 0.78 ms
-    provision(board, bank, Settings(start=False))
+    provision(board, a_bank(), Settings(start=False))
     begin = len(chip.drivers.log)
     board.start()
     chip.run(15_000)
     rows, _ = lit_rows(chip.drivers.log[begin:])
-    check_round(rows, np.roll(told, -int(told.any(1).argmax()), axis=0), 100)
+    check_round(rows, np.roll(EXPECTED, -int(EXPECTED.any(1).argmax()), axis=0), 100)
     assert chip.longest[16 + Dma.IRQ] < 12 * US
 
 
-@pytest.mark.parametrize("kind", ["7E2", "8O1, turned"])
-def test_a_stream_rests_while_nothing_is_sent(kind, device, board):
+def test_a_stream_rests_while_nothing_is_sent(serial, device, board):
     """The board's idle pattern would be characters: packets of pause keep it from being shown."""
-    link, symbols, told = packet_of(kind)
+    link, symbols, told = serial
     with board.stream(link) as stream:
         stream.wait(0.05)
         assert stream.send(symbols) == 0
@@ -394,16 +368,16 @@ def test_a_stream_rests_while_nothing_is_sent(kind, device, board):
     assert (stream.underruns, stream.sent) == (0, 4)
     chips = device.records().played().chips(link.bar.led_clusters())
     packets = chips.reshape(-1, len(told))
-    sent = (packets == told[:, 0]).all(1)
-    assert (packets[~sent] == told[0, 0]).all(), "the level of a pause"
+    sent = (packets == told).all(1)
+    assert (packets[~sent] == 1).all(), "the level of a pause"
     assert sent.sum() == 4
     assert np.flatnonzero(sent)[0] >= 3, "it rests from the first chip on"
     assert sent[-3:].all(), "behind one another"
     assert not device.shown().any()
 
 
-def test_what_would_be_characters_is_refused(board):
-    link, symbols, _ = packet_of("7E2")
+def test_what_would_be_characters_is_refused(serial, board):
+    link, symbols, _ = serial
     bank = bank_of(symbols[None], link)
     with pytest.raises(ConfigError, match="watchdog = idle: LEDs that are on for a chip of two say"):
         provision(board, bank, Settings(watchdog=Watchdog.IDLE))

@@ -1,10 +1,8 @@
 """`evlcp board` against running boards: commands, exit codes, traces, emulators."""
 
-import contextlib
 import json
 import os
 import pty
-import resource
 import signal
 import socket
 import subprocess
@@ -14,15 +12,12 @@ import tty
 import numpy as np
 import pytest
 import typer
-from board_lines import Native, check_fault, some_bank, well
+from board_lines import Native, check_fault, well
 
-from evlcp_sdk.errors import OutputError
-from firmware_host.board.board import Board
-from firmware_host.board.session import Session
 from firmware_host.board.survey import find, survey
 from firmware_host.emulators.led_record import RECORD, LedRecord
-from firmware_host.errors import LineError, NoBoardError
-from firmware_host.ports.transport import open_transport
+from firmware_host.emulators.native import NativeBoard
+from firmware_host.errors import NoBoardError
 from firmware_host.ports.usb import SerialPort
 from tests.conftest import Run
 
@@ -310,40 +305,12 @@ def test_an_emulator_leaves_a_users_file_alone(evlcp, tmp_path, option):
     assert path.read_text() == "mine"
 
 
-def test_a_flash_file_is_replaced_whole(tmp_path):
-    flash, place, payload = tmp_path / "flash.bin", f"unix:{tmp_path / 'board'}", some_bank()
-
-    @contextlib.contextmanager
-    def started():
-        emulated = Emulated("native", "--listen", place, "--flash", flash)
-        try:
-            with Session(open_transport(place)) as session:
-                yield emulated, Board(session)
-        finally:
-            emulated.end()
-
-    with started() as (emulated, board):
-        assert flash.stat().st_mode & 0o777 == 0o600  # it may hold a key
+def test_a_flash_file_is_as_private_as_it_was(tmp_path):
+    flash = tmp_path / "flash.bin"
+    for mode in (0o600, 0o640):  # it may hold a key
+        NativeBoard(flash=flash).close()
+        assert flash.stat().st_mode & 0o777 == mode
         flash.chmod(0o640)
-        board.program(payload)
-        for number in range(1, 4):
-            with flash.open("rb") as old:
-                before = flash.read_bytes()
-                assert board.save().save_sequence == number
-                # who opened the old file still reads it whole: the new one is another
-                assert old.read() == before
-            assert flash.read_bytes() != before
-        saved = flash.read_bytes()
-        assert flash.stat().st_mode & 0o777 == 0o640
-        # The system takes no more in the middle of the next write.
-        resource.prlimit(emulated.process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
-        with pytest.raises(LineError):
-            board.save()
-        assert emulated.process.wait(10) == OutputError.exit_code
-    assert flash.read_bytes() == saved
-    with started() as (_, board):
-        assert board.recall().save_sequence == 3
-        assert board.holds(payload, board.status())
 
 
 @pytest.mark.parametrize(

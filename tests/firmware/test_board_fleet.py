@@ -124,25 +124,6 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards, tmp_path):
     check_fault(refused, 2, "write --port there")
 
 
-def test_the_packets_of_an_inventory_are_those_of_tx_message(evlcp, tmp_path):
-    pytest.importorskip("cryptography", reason="the extra sign is not installed")
-    (tmp_path / "site.toml").write_text(SITE)
-    well(evlcp("tx", "keygen", tmp_path / "private.pem"))
-    options = ("--beacon", tmp_path / "site.toml", "--key", tmp_path / "private.pem", "--user", "north")
-    done = evlcp("tx", "message", "--text", "hi", *options, "--sequence", 9, "--repeat", 2, "--json")
-    (tmp_path / "symbols.json").write_text(done.out)
-    keys = (
-        'text = "hi"\nbeacon = "site.toml"\nkey = "private.pem"\nuser = "north"\nsequence = 9\nrepeat = 2\n'
-    )
-    contents = []
-    for payload in (keys, 'payload = "symbols.json"\n'):
-        (tmp_path / "one.toml").write_text(BOARD + payload)
-        (bank,) = read_inventory(tmp_path / "one.toml").banks.values()
-        contents.append(bank.content)
-        assert bank.packets == json.loads(done.out)["packets"]
-    assert contents[0] == contents[1]
-
-
 @pytest.mark.parametrize(
     ("text", "code", "expected"),
     [

@@ -3,7 +3,6 @@
 import json
 import re
 import signal
-import socket
 import subprocess
 import time
 from contextlib import nullcontext
@@ -20,8 +19,7 @@ from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.simulated import SimulatedLine
 from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
-from firmware_host.ports.transport import ReplayTransport, SocketTransport, TraceTransport
-from firmware_host.protocol.client import Timing
+from firmware_host.ports.transport import SocketTransport, TraceTransport
 from firmware_host.protocol.generated.requests import BoardFault, State, Status, StatusReply, Watchdog
 from tests.models.usb import UsbLine
 
@@ -112,16 +110,15 @@ def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp
     assert json.loads(evlcp(*board, "status", "--json").out)["state"] == "dark"
 
 
-@pytest.mark.parametrize(("latency_s", "frame_s", "at_most"), [(0.0, 0.0, 1.15), (0.002, 0.001, 1.3)])
-def test_programming_takes_the_wire_time(device, latency_s, frame_s, at_most):
-    """By the board's own clock, over a line alone and behind a USB bridge: few waits for answers."""
+def test_programming_takes_the_wire_time(device):
+    """By the board's own clock, behind a USB bridge: few waits for answers."""
     baud = 1_000_000
-    board = board_on(UsbLine(device, latency_s, baud, frame_s))
+    board = board_on(UsbLine(device, 0.002, baud, 0.001))
     bank = some_bank(64)
     began_us = device.now_us
     assert provision(board, bank, Settings()).written == len(bank.content)
     wire_us = 10e6 * len(bank.content) / baud
-    assert wire_us < device.now_us - began_us <= at_most * wire_us
+    assert wire_us < device.now_us - began_us <= 1.3 * wire_us
 
 
 def test_another_rate_while_it_plays_is_refused_before_anything_is_sent(device):
@@ -161,23 +158,6 @@ def test_a_second_host_learns_of_the_first(evlcp, native):
             Board(session).status()
 
 
-def test_a_socket_that_stays_silent_or_hangs_up_is_not_told_to_look_at_power():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = f"tcp:127.0.0.1:{server.getsockname()[1]}"
-        for hangs_up, says in (
-            (False, "another host may be connected"),
-            (True, "hangs up before it answers"),
-        ):
-            with Session(SocketTransport.connect(port), Timing(latency_s=0.01), tries=1) as session:
-                line = server.accept()[0]
-                if hangs_up:
-                    line.close()
-                with pytest.raises(NoBoardError, match=says) as told:
-                    session.hello()
-                assert "power" not in str(told.value)
-                line.close()
-
-
 def test_a_monitor_finds_its_board_again(device):
     """A line that breaks, a board that is off for a while, and one that was reset."""
 
@@ -206,22 +186,6 @@ def test_a_monitor_finds_its_board_again(device):
     assert not list(lines)
     with pytest.raises(NoBoardError):
         list(watch(off, 0.01, count=1))
-
-
-def test_a_trace_follows_no_link_and_outlasts_its_host(device, tmp_path):
-    def traced(path):
-        return TraceTransport(SimulatedLine(device), path, 9600, 1, 2)
-
-    trace = traced(tmp_path / "wire.jsonl")
-    trace.write(b"abc")
-    trace.close()
-    assert ReplayTransport(tmp_path / "wire.jsonl").nonce == 2
-    (tmp_path / "victim").write_text("mine")
-    (tmp_path / "link.jsonl").symlink_to(tmp_path / "victim")
-    for name, says in (("link.jsonl", "it is a link"), ("no/wire.jsonl", "No such file")):
-        with pytest.raises(OutputError, match=rf"{name}: cannot be written: {says}"):
-            traced(tmp_path / name)
-    assert (tmp_path / "victim").read_text() == "mine"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")

@@ -50,12 +50,6 @@ def test_what_comes_later_stands_at_the_end():
         generate.render("requests.py", table)
 
 
-def test_types_and_names_are_unique():
-    table = definition()["message"]
-    assert len({m["type"] for m in table}) == len({m["name"] for m in table}) == len(table)
-    assert all(m["type"] < messages.REPLY_BIT for m in table)
-
-
 @pytest.mark.parametrize("vector", VECTORS, ids=lambda v: v.name)
 def test_golden_vector(vector):
     d = vector.datagram

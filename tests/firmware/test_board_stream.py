@@ -329,15 +329,6 @@ def test_a_stopped_stream_is_empty(device, board, how, at_once):
     board.verify(some_bank())
 
 
-def test_messages_are_played_until_they_are_stopped(device, board):
-    asked = []
-    with board.stream(LINK) as stream:
-        stream.play(lambda _: symbols_of(3), 60.0, lambda: len(asked) > 20 or asked.append(0) is not None)
-    assert stream.sent < 22
-    status = board.status()
-    assert (status.state, status.packets_sent) == (State.DARK, stream.sent)
-
-
 def test_a_text_of_many_packets_leaves_no_gap(board):
     """Each takes half as long to make as to play: all of them at once would starve the board."""
     line = board.session.transport

@@ -16,7 +16,6 @@ from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import BoardError, IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.protocol.generated import requests as protocol
 from firmware_host.protocol.generated.requests import BoardFault, State, Status
-from tests.models.usb import UsbLine
 
 
 def package(seed, count=400):
@@ -159,24 +158,6 @@ def test_what_is_interrupted_keeps_the_old_one_and_ends_well_later(device):
     assert (update_status(board).running, update_status(board).trial) == (1, 0)
     assert update(board, new).image == 2
     assert image_of(device, 2, 20_000) == new.images[2]
-
-
-class SlowLine(UsbLine):
-    """A line and a board that take two hundred times as long as they should."""
-
-    def now(self):
-        return 200 * super().now()
-
-    def read(self, timeout_s):
-        return super().read(timeout_s / 200)
-
-
-def test_a_slow_board_is_waited_for(device):
-    board = board_on(SlowLine(device, 0.0), latency_s=0.1)
-    done = update(board, package(3, 30_000))
-    assert (done.image, device.bench.running) == (1, 1)
-    # the first ones go out again; then it is known how long an answer takes
-    assert board.session.client.retries < 20
 
 
 def test_a_board_with_a_key_takes_updates_from_its_host_alone(device, board):
