@@ -4,10 +4,9 @@ import json
 from contextlib import ExitStack
 
 import pytest
-from board_lines import SITE, Native, check_fault, options_of, well
+from board_lines import SITE, Native, check_fault, well
 
 from firmware_host.board.fleet import read_inventory
-from firmware_host.errors import IncompatibleError
 
 BOARD = '[[board]]\nid = "a"\nport = "native:"\nposition_m = [0, 0, 0]\n'
 GOOD = BOARD + "random = 1\n"
@@ -46,19 +45,6 @@ def test_a_boards_link(tmp_path):
     text = file.read_text().replace("random = 16", 'random = 16\nlink = {modulation = {id = "wh8"}}')
     file.write_text(text)
     assert [bank.codebook.profile for bank in read_inventory(file).banks.values()] == ["wh8", "wh4x2"]
-
-
-def test_a_payload_has_its_own_link(evlcp, tmp_path):
-    options = options_of("modulation.id=wh8", "air.chip_rate_hz=5000.0")
-    well(evlcp("tx", "message", "--text", "a", "-o", tmp_path / "m.json", *options))
-    file = tmp_path / "one.toml"
-    entry = BOARD + 'payload = "m.json"\n'
-    file.write_text(entry)
-    (bank,) = read_inventory(file).banks.values()
-    assert (bank.codebook.profile, bank.chip_rate_hz) == ("wh8", 5000)
-    file.write_text(entry + "link = {air = {chip_rate_hz = 5000.0}}\n")
-    with pytest.raises(IncompatibleError, match=r"board\[0\]: .*modulation\.id: sent with .*wh8"):
-        read_inventory(file)
 
 
 def test_two_of_four(evlcp, boards, tmp_path):

@@ -3,6 +3,7 @@
 import json
 import re
 import signal
+import socket
 import subprocess
 import time
 from contextlib import nullcontext
@@ -21,7 +22,6 @@ from firmware_host.emulators.simulated import SimulatedLine
 from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
 from firmware_host.ports.transport import SocketTransport, TraceTransport
 from firmware_host.protocol.generated.requests import BoardFault, State, Status, StatusReply, Watchdog
-from tests.models.usb import UsbLine
 
 
 def test_a_host_that_stays_keeps_the_watchdog_still(device, board):
@@ -110,17 +110,6 @@ def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp
     assert json.loads(evlcp(*board, "status", "--json").out)["state"] == "dark"
 
 
-def test_programming_takes_the_wire_time(device):
-    """By the board's own clock, behind a USB bridge: few waits for answers."""
-    baud = 1_000_000
-    board = board_on(UsbLine(device, 0.002, baud, 0.001))
-    bank = some_bank(64)
-    began_us = device.now_us
-    assert provision(board, bank, Settings()).written == len(bank.content)
-    wire_us = 10e6 * len(bank.content) / baud
-    assert wire_us < device.now_us - began_us <= 1.3 * wire_us
-
-
 def test_another_rate_while_it_plays_is_refused_before_anything_is_sent(device):
     line = recording(device)
     board = board_on(line)
@@ -156,6 +145,14 @@ def test_a_second_host_learns_of_the_first(evlcp, native):
     for _ in range(20):
         with Session(SocketTransport.connect(native)) as session:
             Board(session).status()
+
+
+def test_a_socket_that_hangs_up_is_told():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        line = SocketTransport.connect(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        server.accept()[0].close()
+        with Session(line) as session, pytest.raises(NoBoardError, match="hangs up before it answers"):
+            session.hello()
 
 
 def test_a_monitor_finds_its_board_again(device):

@@ -193,6 +193,8 @@ def test_banks_are_held(wire):
     for number, at in ((2, 0), (0, 40960), (0, 2**32 - 1)):
         assert wire.ask(protocol.WriteRequest(number, at, b"x")) == Status.OUT_OF_RANGE
     assert wire.ask(protocol.ReadRequest(0, 0, 508)) == Status.OUT_OF_RANGE
+    pushed = [protocol.PushRequest(number, 0, 0, 0, b"x") for number in (2, 0)]
+    assert wire.each(*pushed) == [Status.OUT_OF_RANGE, Status.NOTHING_COMMITTED]
 
 
 def test_a_foreign_codebook_never_plays(wire):

@@ -253,29 +253,6 @@ def test_a_broken_thermal_wire_is_too_hot(bar):
     assert not bar.dark
 
 
-def test_led_test_and_save_wait_until_the_last_rows_have_left(bar):
-    for then in ("test", "save"):
-        bar.board.start()
-        bar.chip.run(5_000)
-        bar.board.stop()
-        begin = len(bar.log)
-        while bar.board.status().state != State.DARK:  # the core has ended, the chain has not
-            pass
-        if then == "save":
-            bar.board.save()
-        else:
-            bar.board.test_leds(7, 7, 2)
-        rows, _ = lit_rows(bar.log[begin:])
-        lit = np.flatnonzero(rows.any(1))
-        single = [s.row for s in bar.log[begin:] if s.row.bit_count() == 1]
-        assert single == ([1 << 95 - 7] * len(single) if then == "test" else [])
-        whole = bar.expected(len(bar.chips) * 3)
-        last = lit[rows[lit].sum(1) > 1][-1]
-        assert (rows[last] == whole[np.flatnonzero(whole[: len(bar.chips)].any(1))[-1]]).all()
-        assert bar.board.status().faults == 0
-        bar.board.blank()
-
-
 def test_emulate_serves_the_model(evlcp, stm32, tmp_path):
     listen, record, out = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "chips.npy"
     emulated = Emulated("stm32", "--listen", listen, "--leds", record)

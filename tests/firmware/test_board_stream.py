@@ -10,7 +10,6 @@ from board_lines import (
     board_link,
     board_on,
     packets_shown,
-    shown,
     some_bank,
     state_of,
     symbols_of,
@@ -24,7 +23,7 @@ from firmware_host.board.board import Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import BoardResetError, IncompatibleError, RefusedError, VerifyError
 from firmware_host.protocol.generated import requests as protocol
-from firmware_host.protocol.generated.requests import BoardFault, Capability, Format, State, Status, Watchdog
+from firmware_host.protocol.generated.requests import BoardFault, Capability, Format, State, Watchdog
 from tests.models.usb import UsbLine
 
 LONG = board_link("air.frames_per_packet=40", "air.pilot_every=4")
@@ -246,25 +245,6 @@ def test_the_queue_takes_what_a_queue_should(data):
         assert held[at : at + 10_240] == model.packets[n]
 
 
-def test_masks_may_be_streamed_too(device, board):
-    like = queue_of(LINK)
-    board.prepare(like)
-    digest = bytes.fromhex(LINK.codebook.digest)
-    assert board.session.call(protocol.StreamRequest(1, Format.MASKS, digest)).slots == 40960 // (346 * 12)
-    rows = np.random.default_rng(0).integers(0, 2, (346, 96), dtype=np.uint8)
-    content = np.packbits(rows, axis=1).tobytes()
-    for at in range(0, len(content), 480):
-        piece = content[at : at + 480]
-        board.session.call(protocol.PushRequest(1, 0, at, int(at + 480 >= len(content)), piece))
-    board.start()
-    device.run(60_000)
-    assert shown(device).tobytes() == rows.tobytes()
-    assert board.status().state == State.DARK
-    for bank, status in ((0, Status.NOTHING_COMMITTED), (2, Status.OUT_OF_RANGE)):
-        with pytest.raises(RefusedError, match=status.name):
-            board.session.call(protocol.PushRequest(bank, 0, 0, 0, b"x"))
-
-
 @pytest.mark.parametrize("latency_s", [0.0, 0.016])
 def test_what_changes_is_right_at_its_first_chip(device, latency_s):
     """A countdown made for `delay_s` ahead, against the ticks at which the board showed it."""
@@ -327,24 +307,3 @@ def test_a_stopped_stream_is_empty(device, board, how, at_once):
     provision(board, some_bank(), Settings())
     assert state_of(board) == (State.PLAYING, 0)
     board.verify(some_bank())
-
-
-def test_a_text_of_many_packets_leaves_no_gap(board):
-    """Each takes half as long to make as to play: all of them at once would starve the board."""
-    line = board.session.transport
-    some = symbols_of(25)
-
-    with board.stream(LINK, 2) as stream:
-
-        def slowly(number):
-            def made():
-                for packet in some:
-                    stream.wait(stream.packet_s / 2)
-                    yield packet
-
-            return made() if number < 3 else None
-
-        stream.play(slowly, 1.0)
-        assert line.now() > 2.0
-    assert stream.underruns == 0
-    assert stream.sent >= 75

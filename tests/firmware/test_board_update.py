@@ -160,17 +160,6 @@ def test_what_is_interrupted_keeps_the_old_one_and_ends_well_later(device):
     assert image_of(device, 2, 20_000) == new.images[2]
 
 
-def test_a_board_with_a_key_takes_updates_from_its_host_alone(device, board):
-    key = bytes(range(16))
-    provision(board, some_bank(), Settings(start=False))
-    board.set_key(key)
-    board.save()  # or the key is gone with the restart
-    with pytest.raises(RefusedError, match="NEEDS_KEY"):
-        update(board_on(device), package(1))
-    assert device.bench.running == 0
-    assert update(board_on(device, key=key), package(1)).image == device.bench.running == 1
-
-
 def test_a_file_of_an_update(tmp_path):
     path = tmp_path / "a.update.json"
     path.write_text(package(1).to_json())
