@@ -43,13 +43,6 @@ def received(name: str, *settings: str) -> Statistics:
     return scored(name, load_link(overrides=[f"modulation.id={profile}", *settings]))
 
 
-def test_two_clusters_are_worse() -> None:
-    """The method that the paper compares with is one configuration, and loses, as in the paper."""
-    links = (ROOT / "examples" / name for name in ("links/paper.toml", "campaigns/two-clusters.toml"))
-    paper, two = (scored("day-35m-20kmh", load_link(link)).total().rmse_m for link in links)
-    assert two > 1.5 * paper
-
-
 PAPER = ("decoding.id=wh-transform", "ranging.id=poc")
 JOINT = ("ranging.id=joint-scale", "tracking.id=kalman")
 
