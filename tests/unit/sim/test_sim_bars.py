@@ -102,10 +102,10 @@ def test_leds_that_no_scene_can_hold_are_refused() -> None:
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 50.0, "heading_deg": 20.0}
 
 
-def blocks_of(light: BarLight, packets: int, first: int = 0) -> list[Block]:
+def blocks_of(light: BarLight, packets: int) -> list[Block]:
     """What packets of a bar say."""
     coder, bits = light.link.block_coder(), light.link.codebook.bits_per_symbol
-    sent = [bits_of_symbols(light.symbols(first + q), bits) for q in range(packets)]
+    sent = [bits_of_symbols(light.symbols(q), bits) for q in range(packets)]
     return [Block.unpack(coder.block((4 - 8.0 * one).astype(np.float32)) or b"") for one in sent]
 
 
@@ -118,13 +118,6 @@ def test_random_data_is_a_message_a_packet() -> None:
         ]
         assert len({b.part for b in blocks}) == 3
         assert {(len(b.part), b.length) for b in blocks} == {(40, 40)}
-    other = {
-        "modulation": {"id": "raw8"},
-        "air": {"frames_per_packet": 20, "pilot_every": 4},
-        "error-correction": {"id": "none"},
-    }
-    light = sources_of(resolve_scene({"bars": [{"payload": "data", "link": other}]}))[0][0]
-    assert [block.sequence for block in blocks_of(light, 1, first=5)] == [5]
 
 
 def test_a_bar_in_the_world_sends_its_beacon() -> None:
