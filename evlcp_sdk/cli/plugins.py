@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 from evlcp_sdk.cli._common import Json, echo, print_json
 
 if TYPE_CHECKING:
-    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.plugin.registry import Installed, Registry
 
 
 def plugins(as_json: Json = False) -> None:
     """List the roles, the algorithms installed, and broken plugins.
 
     `*` marks the default of a role, `!` two algorithms of one id, of which none can be used. Select an
-    algorithm by its id: [bold]evlcp receive REC.raw -o out --set modulation.id=wh8[/]
+    algorithm by its id: [bold]evlcp receive REC.raw -o out --set modulation.id=wh8[/]. Others' algorithms are
+    imported, to see whether they can be.
 
     Exit code 0, also when plugins are broken and left out.
     """
@@ -48,6 +49,7 @@ def table_of(registry: Registry) -> dict[str, list[dict[str, Any]]]:
                 "version": e.version,
                 "default": ROLES[e.algorithm.role].default == e.algorithm.id,
                 "conflict": count[e.algorithm.role, e.algorithm.id] > 1,
+                "fault": _fault(e),
             }
             for e in entries
         ],
@@ -55,6 +57,19 @@ def table_of(registry: Registry) -> dict[str, list[dict[str, Any]]]:
             {"plugin": b.plugin, "distribution": b.distribution, "reason": b.reason} for b in registry.broken
         ],
     }
+
+
+def _fault(one: Installed) -> str | None:
+    """Why an algorithm of somebody else's cannot be used; None for one that can."""
+    from evlcp_sdk.errors import PluginError
+    from evlcp_sdk.plugin.registry import load_class
+
+    try:
+        if one.distribution != "evlcp-sdk":
+            load_class(one)
+    except PluginError as fault:
+        return str(fault)
+    return None
 
 
 def _text(table: dict[str, list[dict[str, Any]]]) -> str:
@@ -68,6 +83,7 @@ def _text(table: dict[str, list[dict[str, Any]]]) -> str:
                 mark = "!" if a["conflict"] else "*" if a["default"] else " "
                 cells = (f"{a[k]!s:<{w}}" for k, w in zip(keys, widths, strict=True))
                 lines.append(f"{mark} {'  '.join(cells)}".rstrip())
+    lines += [f"broken: {a['fault']}" for a in table["algorithms"] if a["fault"] is not None]
     for b in table["broken"]:
         owner = f" of {b['distribution']}" if b["distribution"] else ""
         lines.append(f"broken: plugin {b['plugin']}{owner}: {b['reason']}")

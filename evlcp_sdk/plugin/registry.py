@@ -236,9 +236,7 @@ class Registry:
             UnknownAlgorithmError: None is installed.
             PluginError: Its target cannot be imported, or does not fill the role; or as `find`.
         """
-        entry = self.find(role, id)
-        who = f"{role} algorithm '{id}' of {entry.distribution}"
-        return load_target(who, entry.algorithm.target, ROLES[role].abstract)
+        return load_class(self.find(role, id))
 
     def versions(self) -> dict[str, str]:
         """Versions of Python, the SDK, what it computes with, and all distributions that bring algorithms."""
@@ -310,6 +308,17 @@ class Registry:
             for record, owner in self.collect("evlcp_algorithms", Algorithm, _algorithm_fault):
                 self._collected.setdefault((record.role, record.id), []).append(Installed(record, *owner))
         return self._collected
+
+
+def load_class(one: Installed) -> type[Any]:
+    """Import the class of an algorithm.
+
+    Raises:
+        PluginError: Its target cannot be imported, or does not fill the role.
+    """
+    role = one.algorithm.role
+    who = f"{role} algorithm '{one.algorithm.id}' of {one.distribution}"
+    return load_target(who, one.algorithm.target, ROLES[role].abstract)
 
 
 def load_target(who: str, target: str, kind: type[Any] = object) -> type[Any]:

@@ -189,14 +189,16 @@ def test_the_command_line_goes_on_without_a_broken_plugin(stranger, reason, monk
 def test_broken_and_conflicting_plugins_are_listed(monkeypatch: pytest.MonkeyPatch, evlcp: Any) -> None:
     owners = ("evlcp-sdk", "evlcp-fast")
     both = [(owner, owner, lambda: Brings(ranging("poc"))) for owner in owners]
-    install(monkeypatch, *both, ("cam", "evlcp-cam", missing))
+    lost = ("lost", "evlcp-lost", lambda: Brings(ranging("lost", "nowhere:Nothing")))
+    install(monkeypatch, *both, ("cam", "evlcp-cam", missing), lost)
     done = evlcp("plugins")
     assert done.code == 0
-    assert [line[:6] for line in done.out.splitlines() if "poc" in line] == ["! poc "] * 2
+    assert [line[:6] for line in done.out.splitlines() if line[2:5] == "poc"] == ["! poc "] * 2
     assert "ranging: a decoded frame's image -> distance\n" in done.out
+    assert "\nbroken: ranging algorithm 'lost' of evlcp-lost: cannot import nowhere:Nothing: Mod" in done.out
     assert done.out.endswith("broken: plugin cam of evlcp-cam 1.0: " + BROKEN["import"][1] + "\n")
     table = json.loads(evlcp("plugins", "--json").out)
-    assert [a["conflict"] for a in table["algorithms"]] == [True, True]
+    assert [a["conflict"] for a in table["algorithms"]] == [False, True, True]
     assert table["broken"][0]["plugin"] == "cam"
     assert {"role": "ranging", "verb": ROLES["ranging"].verb, "default": "joint-scale"} in table["roles"]
 
