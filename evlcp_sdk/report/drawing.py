@@ -57,10 +57,12 @@ def draw_plots(plots: Sequence[Plot], title: str) -> Figure:
 def _draw_on(axis: Axes, plot: Plot) -> None:
     for shape in plot.shapes:
         _draw_shape(axis, shape)
+    middle = sum(x for x, _, _ in plot.names) / max(len(plot.names), 1)
     for x, y, text in plot.names:
+        # Outward, as what stands side by side would cover the names of one another.
         axis.annotate(
-            text, (x, y), xytext=(0, 3), textcoords="offset points", fontsize=8,
-            color=INK_COLOUR, path_effects=[withStroke(linewidth=3, foreground="white")],
+            text, (x, y), xytext=(0, 3), textcoords="offset points", fontsize=8, color=INK_COLOUR,
+            ha="right" if x < middle else "left", path_effects=[withStroke(linewidth=3, foreground="white")],
         )  # fmt: skip
     if plot.log_y:
         axis.set_yscale("log")
