@@ -242,12 +242,6 @@ def simulate(_work, _demo):
     return Trial(*arguments, "a.truth.json")
 
 
-def tx(_work, _demo):
-    """Symbols and chips over those of another message."""
-    files = ("-o", "OUT/m.json", "--chips", "OUT/c.npy", "--sequence", "1")
-    return Trial(*(("tx", "message", "--text", text, *files) for text in ("a", "b")), "m.json")
-
-
 def sweep(work):
     """A campaign that meets a fault is whole after the same command once more; what was kept is true."""
     plan = fake_plan(2, 1, 1)
@@ -297,7 +291,7 @@ def sweep(work):
 def tell(name, work, demo):
     # Looked up once for all forks.
     typer.main.get_params_from_function = cache(typer.main.get_params_from_function)
-    trials = {"receive": receive, "sinks": sinks, "simulate": simulate, "tx": tx}
+    trials = {"receive": receive, "sinks": sinks, "simulate": simulate}
     faults, calls = sweep(work) if name == "sweep" else trials[name](work, demo).faults(work)
     print(json.dumps({"faults": faults, "calls": calls}))
 

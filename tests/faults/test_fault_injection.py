@@ -28,7 +28,7 @@ def shim(tmp_path_factory):
 
 
 @needs_compiler
-@pytest.mark.parametrize("command", ["receive", "sinks", "simulate", "tx", "sweep"])
+@pytest.mark.parametrize("command", ["receive", "sinks", "simulate", "sweep"])
 def test_a_disk_that_fails_once(command, shim, tmp_path, demo_raw):
     if command == "sinks":
         pytest.importorskip("pyarrow", reason="the extra parquet is not installed")

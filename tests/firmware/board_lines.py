@@ -3,8 +3,6 @@
 import shutil
 import threading
 from itertools import pairwise
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from firmware_host.emulators.listening import HostLine
 from firmware_host.emulators.native import NativeBoard, serve
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.datagram import Datagram
 
 PACKET = 346
 LINK = load_link()
@@ -104,24 +101,6 @@ def check_fault(done, code, *says):
     assert [words for words in says if words not in done.err] == [], done.err
 
 
-class Vector(NamedTuple):
-    """A golden vector: a datagram and its bytes on the wire."""
-
-    name: str
-    datagram: Datagram
-    wire: bytes
-
-
-def read_vectors():
-    """The golden vectors: `name type status sequence session payload wire` in hex, `-` for no payload."""
-    path = Path(__file__).parents[1] / "vectors" / "wire-vectors.txt"
-    for line in path.read_text(encoding="ascii").splitlines():
-        if line and not line.startswith("#"):
-            name, *numbers, payload, wire = line.split()
-            body = b"" if payload == "-" else bytes.fromhex(payload)
-            yield Vector(name, Datagram(*(int(n, 16) for n in numbers), body), bytes.fromhex(wire))
-
-
 class Native:
     """A native board in the background, as `evlcp board emulate native` runs it; options are its own."""
 
@@ -182,7 +161,6 @@ class NoisyLine(SimulatedLine):
         self.rates = (flips, drops, doubles)
         self.random = np.random.default_rng(seed)
         self.counts = {"flipped": 0, "dropped": 0, "doubled": 0}
-        self.late = []
 
     def spoil(self, data):
         flips, drops, doubles = self.rates
@@ -201,12 +179,7 @@ class NoisyLine(SimulatedLine):
             return out[:at] + out[at + 1 :]
         if what < 2 * drops + doubles:
             self.counts["doubled"] += 1
-            # half of the doubles come at once, half after what is sent next
-            if self.random.random() < 0.5:
-                return out + out
-            self.late.append(out)
-        elif self.late and self.random.random() < 0.5:
-            return out + self.late.pop()
+            return out + out
         return out
 
     to_board = to_host = spoil

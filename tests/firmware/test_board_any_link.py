@@ -197,15 +197,6 @@ def test_what_the_firmware_refuses(device, board):
     board.prepare(bank)
     device.run(10_000)
     assert not device.shown().any()
-    # bits beyond the last cluster light nothing
-    padded = bytearray(bank.content)
-    for at in range(121, len(padded), 2):
-        padded[at] |= 0x3F
-    board.fill(0, bytes(padded))
-    board.session.call(replace(commit, crc=zlib.crc32(padded)))
-    board.start()
-    device.run(50_000)
-    check_round(shown(device), EXPECTED, 400)
 
 
 def test_what_hello_says_decides(board):

@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
-from board_lines import FatalLine, board_link, board_on, check_fault, recording, some_bank, well
+from board_lines import FatalLine, board_on, check_fault, some_bank, well
 from test_board_cli import EVLCP
 
 from evlcp_sdk.errors import OutputError
@@ -19,9 +19,9 @@ from firmware_host.board.monitor import Back, Gone, watch
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.simulated import SimulatedLine
-from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
+from firmware_host.errors import LineError, NoBoardError, VerifyError
 from firmware_host.ports.transport import SocketTransport, TraceTransport
-from firmware_host.protocol.generated.requests import BoardFault, State, Status, StatusReply, Watchdog
+from firmware_host.protocol.generated.requests import BoardFault, State, StatusReply, Watchdog
 
 
 def test_a_host_that_stays_keeps_the_watchdog_still(device, board):
@@ -108,22 +108,6 @@ def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp
         rf"evlcp: {native}: {said} \(pulses since reset: .* 0\): check .*; all are stopped\n", done.err
     )
     assert json.loads(evlcp(*board, "status", "--json").out)["state"] == "dark"
-
-
-def test_another_rate_while_it_plays_is_refused_before_anything_is_sent(device):
-    line = recording(device)
-    board = board_on(line)
-    provision(board, some_bank(2), Settings())
-    line.written = b""
-    fast = some_bank(2, 1, board_link("air.chip_rate_hz=20000.0"))
-    says = r"plays 10000 chips per second.*has 20000.*stop' first"
-    with pytest.raises(RefusedError, match=says) as refused:
-        provision(board, fast, Settings())
-    assert refused.value.status == Status.BUSY
-    assert len(line.written) < 100, "only STATUS went out"
-    board.stop()
-    board.wait_dark()
-    assert provision(board, fast, Settings()).swapped
 
 
 def test_a_bank_that_does_not_hold_is_told(board, monkeypatch):

@@ -18,7 +18,7 @@ from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
-from firmware_host.board.bank import bank_of, queue_of
+from firmware_host.board.bank import queue_of
 from firmware_host.board.board import Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import BoardResetError, IncompatibleError, RefusedError, VerifyError
@@ -104,27 +104,6 @@ def test_a_noisy_line_loses_and_doubles_nothing(device, seed):
     assert line.counts["doubled"]
     found, _ = played(device, link)
     assert found == expected(packets, link)
-
-
-def test_from_a_bank_to_a_stream_and_back_without_a_torn_packet(device, board):
-    first, second, last = symbols_of(2, 1), symbols_of(5, 2), symbols_of(1, 3)
-    provision(board, bank_of(first, LINK), Settings())
-    device.run(100_000)
-    stream = board.stream(LINK)
-    for packet in second:
-        stream.send(packet)
-    while stream._flight:
-        stream.wait(0.01)
-    stream.wait(0.3)
-    provision(board, bank_of(last, LINK), Settings())
-    device.run(200_000)
-    found, _ = played(device)
-    names = [next(i for i, p in enumerate((first, second, last)) if chips in expected(p)) for chips in found]
-    assert names == sorted(names)
-    assert names.count(1) == 5
-    assert names[-1] == 2
-    status = board.status()
-    assert (status.state, status.underruns, status.packets) == (State.PLAYING, 0, 1)
 
 
 def test_the_watchdog_acts_on_a_stream_whose_host_is_gone(device, board):

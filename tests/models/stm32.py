@@ -81,7 +81,6 @@ class Timer(Peripheral):
         self.unit = UNIT_HZ // HSI_HZ  # time of a count
         self.stands = False  # broken: the counter does not move
         self.request = False  # of the update, for DMA
-        self.on_edge = lambda _: None
         self.slave = None
         self.master = None
 
@@ -166,7 +165,7 @@ class Timer(Peripheral):
     def plan(self):
         """Look ahead to the next wrap and the next edge of the output."""
         self.generation += 1
-        self.on_edge(self.output())
+        self.chip.drivers.look()
         if not self.running or self.name == "TIM2":
             return
         here, unit = self.counter(), self.unit
@@ -558,7 +557,6 @@ class Stm32:
         self.longest = {}
         self.tim1, self.tim2, self.tim3 = Timer(self, "TIM1"), Timer(self, "TIM2"), Timer(self, "TIM3")
         self.tim1.slave, self.tim3.master = self.tim3, self.tim1
-        self.tim3.on_edge = lambda _: self.drivers.look()
         self.dma, self.spi, self.usart = Dma(self), Spi(self), Usart(self)
         self.systick, self.iwdg, self.flash = SysTick(self), Iwdg(self), Flash(self)
         self.drivers.latch = False
