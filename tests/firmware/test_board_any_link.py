@@ -280,8 +280,8 @@ def test_the_commands(evlcp, tmp_path, device, board):
 # -- characters, by the test's own encoder
 
 TEXT = b"Tempo 30!"
-LAMP = ["bar.rows=6", "bar.columns=1", "bar.cluster_rows=6", "bar.cluster_columns=1", "framing.id=uart"]
-SERIAL = [*LAMP, "framing.data_bits=7", "framing.parity=even", "framing.stop_bits=2"]
+LAMP = ["bar.rows=6", "bar.columns=1", "bar.cluster_rows=6", "bar.cluster_columns=1"]
+SERIAL = [*LAMP, "framing.id=uart", "framing.data_bits=7", "framing.parity=even", "framing.stop_bits=2"]
 
 
 @pytest.fixture

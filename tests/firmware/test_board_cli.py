@@ -101,8 +101,6 @@ def test_every_command_on_a_board_takes_json_and_a_line():
             # frames says it by --format json; an emulator runs in the foreground
             options = {option for parameter in command.params for option in parameter.opts}
             assert "--json" in options or name in ("frames", "emulate"), name
-            if name in ("hello", "program", "start", "level", "test-leds", "recall"):
-                assert command.line == ("port", "baud", "trace", "replay", "key")
 
 
 HELLO = ("board", "hello", "--port")

@@ -89,7 +89,3 @@ def test_core_calls_only_the_hal(tmp_path):
     header = (build.FIRMWARE / "core" / "hal.h").read_text()
     assert hal == set(re.findall(r"\b(hal_\w+)\(", header))
     assert len(hal) == 18
-    # hal_leds is the only output, and comes first in the chip interrupt
-    player = (build.FIRMWARE / "core" / "player.c").read_text()
-    chip = player[player.index("void evlcp_player_chip(") :]
-    assert chip.index("hal_leds(player->row") < chip.index("hal_lateness") < chip.index("next_packet(")

@@ -7,20 +7,17 @@ import socket
 import subprocess
 import time
 from contextlib import nullcontext
-from pathlib import Path
 
 import pytest
 from board_lines import FatalLine, board_on, check_fault, some_bank, well
 from test_board_cli import EVLCP
 
-from evlcp_sdk.errors import OutputError
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.monitor import Back, Gone, watch
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
-from firmware_host.emulators.simulated import SimulatedLine
 from firmware_host.errors import LineError, NoBoardError, VerifyError
-from firmware_host.ports.transport import SocketTransport, TraceTransport
+from firmware_host.ports.transport import SocketTransport
 from firmware_host.protocol.generated.requests import BoardFault, State, StatusReply, Watchdog
 
 
@@ -167,11 +164,3 @@ def test_a_monitor_finds_its_board_again(device):
     assert not list(lines)
     with pytest.raises(NoBoardError):
         list(watch(off, 0.01, count=1))
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_a_full_disk_ends_a_trace_in_one_line(device):
-    trace = TraceTransport(SimulatedLine(device), Path("/dev/full"), 9600, 1, 2)
-    for end in (lambda: trace.write(bytes(100_000)), trace.close):
-        with pytest.raises(OutputError, match="/dev/full: cannot be written: No space left"):
-            end()

@@ -70,14 +70,6 @@ def test_programming_over_a_very_noisy_line(device):
     assert len(sequence) > 64
 
 
-class HostDiedError(Exception):
-    """The host died here."""
-
-
-def die(_):
-    raise HostDiedError
-
-
 OLD = symbols_of(2, 1)
 
 
@@ -89,25 +81,23 @@ def playing():
     return device
 
 
-def bytes_to_program(bank):
-    """What goes to a board until it plays a bank; the same each time."""
-    line = recording(playing())
-    provision(board_on(line, nonce=7), bank, Settings())
-    return len(line.written)
-
-
 def test_host_killed_at_any_moment():
+    def dies(_):
+        raise KeyboardInterrupt
+
     new = symbols_of(24, 2)
     bank = bank_of(new, LINK)
-    total = bytes_to_program(bank)
+    line = recording(playing())
+    provision(board_on(line, nonce=7), bank, Settings())
+    total = len(line.written)
     random = np.random.default_rng(7)
     # the commit and the wait for it are the last bytes: half of the moments lie there
     moments = [*random.integers(1, total, 8), *random.integers(total - 320, total, 10)]
     ends = {"old": 0, "new": 0}
     for moment in moments:
         device = playing()
-        with pytest.raises(HostDiedError):
-            provision(board_on(FatalLine(device, int(moment), die), nonce=7), bank, Settings())
+        with pytest.raises(KeyboardInterrupt):
+            provision(board_on(FatalLine(device, int(moment), dies), nonce=7), bank, Settings())
         device.run(400_000)
         sequence = packet_sequence(device.records().played(), {"old": OLD, "new": new})
         order = check_order(sequence, {"old": 2, "new": 24})

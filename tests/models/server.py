@@ -59,14 +59,7 @@ def serve(chip, line, leds, stopped):
 
 
 def serve_rom(rom, line, flash, stopped):
-    """Let hosts talk to a ROM, one after the other, until one has it run something, or it is stopped.
-
-    Args:
-        rom: The part.
-        line: Where hosts come.
-        flash: File that holds its flash whenever it has changed.
-        stopped: Ends it.
-    """
+    """Let hosts talk to a ROM until one has it run something; a file holds its flash whenever it changes."""
     answer, held = b"", b""
     while rom.started is None and not stopped():
         data = line.exchange(answer, 0.0 if answer else 0.2)

@@ -139,16 +139,13 @@ class Timer(Peripheral):
                 slave.plan()
             if offset == self.DIER and not value & 0x100:
                 self.request = False
-            if started and self.slave and self.r[self.CR2] & 0x70 == 0x10 and not self.stands:
-                self.slave.trigger()
+            triggered = self.slave and self.slave.r[self.SMCR] & 0x77 == 0x06
+            if started and triggered and self.r[self.CR2] & 0x70 == 0x10 and not self.stands:
+                # a rising edge of ITR0: TIM3's is TIM1's TRGO (RM0090, table 99)
+                self.slave.hold(self.slave.counter())
+                self.slave.r[self.CR1] |= 1
+                self.slave.plan()
         self.plan()
-
-    def trigger(self):
-        """A rising edge of ITR0: TIM3's is TIM1's TRGO (RM0090, table 99)."""
-        if self.r[self.SMCR] & 0x77 == 0x06:
-            self.hold(self.counter())
-            self.r[self.CR1] |= 1
-            self.plan()
 
     def update(self):
         """An update event: a flag, and with UDE a DMA request that stays until it is served."""
