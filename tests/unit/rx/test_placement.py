@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk.rx.placement import layout_of, masked, placements
-from evlcp_sdk.scene.bar import BarLayout, LedGrid
+from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid
 from evlcp_sdk.values import PresenceMap
 
 CENTRES = BarLayout().cluster_centres_m()
@@ -132,6 +132,19 @@ def test_a_panel_and_its_mirror_image(conj):
     assert np.abs(found.scale - scale) < 6
     places = found.places(layout)
     assert np.abs(places[1] - places[0]) == pytest.approx(300 * 0.08, rel=0.03)
+
+
+@pytest.mark.parametrize("column", [0, 1])
+def test_one_column_of_two_is_not_taken_for_the_other_in_a_mirror(column):
+    """It looks the same in both; in an image the layout then stands on the other side."""
+    centres = BarLayout(LedColumns(columns=2, apart_m=2.0, rows=48)).cluster_centres_m()
+    rng, found = np.random.default_rng(column), []
+    for _ in range(24):
+        scale = 120 * np.exp(0.01j * rng.normal())
+        shift = complex(24, 60) + complex(*rng.uniform(-1, 1, 2)) - scale * (2 * column - 1)
+        shown = drawn(centres, (scale, shift), size=(48, 120))
+        found += placements(covered(shown, np.arange(8) + 8 - 8 * column), layout_of(centres))[:1]
+    assert [one.mirrored for one in found] == [False] * 24
 
 
 def test_one_cluster_is_where_its_cells_are():
