@@ -1,6 +1,7 @@
 """The report: what the page holds, that it needs no network, and that a browser draws it."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.comparison import of_campaign
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.plan import Case, Job, Plan
-from evlcp_sdk.study.report import POSITION_HEAD, page, position_rows
+from evlcp_sdk.study.report import POSITION_HEAD, charts_of, page, position_rows
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import PAPER, Series, Summary, beside_paper, summarize
 from evlcp_sdk.study.tally import Statistics, Tally
@@ -92,6 +93,16 @@ def test_a_smaller_figure_is_better_and_a_kept_bound_agrees(summary: Summary) ->
             at = Statistics.of([(reference.from_m, tally)], tasks=1)
             (one,) = beside_paper([Series({}, {"speed_kmh": 30}, link, (at,))], [reference])
             assert one.verdict == verdict, (reference, factor)
+
+
+def test_a_limit_stands_above_the_paper_for_no_want_of_data(summary: Summary) -> None:
+    """3.7 / 400 distances are a limit above the paper's .004, 3.7 / 1200 are none."""
+    at = Statistics.of([(m, Tally.distance(0.0)) for m in (30, 40, 50) for _ in range(400)], tasks=1)
+    series = Series({"scene.speed_kmh": 30}, {"speed_kmh": 30}, summary.series[0].link, (at,))
+    (gross,) = (one for one in charts_of(replace(summary, series=(series,))) if one.id == "gross")
+    gross.markup()
+    (shown,) = [text.splitlines()[1] for *_, text, _ in gross.labels if text.startswith(series.name)]
+    assert shown.startswith("30 to 60 m: below 0.0031")
 
 
 def test_the_page_tells_everything(summary: Summary) -> None:
