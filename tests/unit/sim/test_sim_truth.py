@@ -76,6 +76,7 @@ def test_a_file_without_a_link_is_of_the_default_link() -> None:
         ("bars", 3, "bars = 3: expected a list"),
         ("t_s", [1.0, 0.5], "t_s = [1.0, 0.5]: expected rising times"),
         ("distance_m", [], "distance_m = []: expected one list a bar, 1"),
+        ("distance_m.0", [1.0], "distance_m.0 = [1.0]: expected 50 numbers, one a time of t_s"),
         ("camera_path.attitude_deg", [[1.0], []], "camera_path = {"),
         ("bar_centre_px.0", [[1.0]], "bar_centre_px.0.1: missing"),
         ("bars.0.symbols", [[[1]]], "bars.0.symbols = [[[1]]]: expected packets of 10 frames of 16 symbols"),
