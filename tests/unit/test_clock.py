@@ -226,3 +226,10 @@ def test_a_part_of_a_step_comes_when_it_is_due(seed: int, cuts: list[int], dues:
             if step.start_us < due < step.start_us + STEP_US and any(t >= due for t, *_ in within):
                 want.append((step.start_us, due, [row for row in within if row[0] < due]))
     assert [(s.start_us, s.end_us, rows(s.events)) for s in given_ if not s.whole] == want
+
+
+def test_a_stream_without_events_has_no_steps() -> None:
+    off = Events.of([5, 6], [WIDTH, 0], [0, HEIGHT], [1, 1])
+    steps, timeline = steps_of(Events.concat([Events.empty(), off]), [0, 1], waits=1)
+    assert steps == []
+    assert timeline.clock.counts["events"] == timeline.clock.counts["dropped_off_sensor"] == 2

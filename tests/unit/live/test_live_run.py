@@ -161,6 +161,13 @@ def test_what_there_is_no_time_for_is_left_out_and_counted(demo_raw: Path) -> No
     assert summary["counts"]["events"] + left_out == total
 
 
+def test_slices_that_wait_are_taken_together_and_nothing_is_left_out(demo_raw: Path, monkeypatch) -> None:
+    monkeypatch.setattr("evlcp_sdk.live.loop._TURN_US", 400)
+    mine = (publisher := Publisher()).subscribe({"frame"}, most=100_000)
+    live(Burst(demo_raw), publisher=publisher, budget=PATIENT, warm=False)
+    assert [key(f) for f in gathered(mine)["frame"]] == [key(f) for p in receive(demo_raw) for f in p.frames]
+
+
 def test_distances_are_measured_of_every_nth_frame(demo_raw: Path) -> None:
     frames = []
     for every in (1, 3):

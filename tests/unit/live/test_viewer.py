@@ -4,11 +4,12 @@ import http.client
 import io
 import json
 import math
+import socket
 import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -271,6 +272,16 @@ def test_what_was_recorded_stays_where_a_recording_has_to_end(why, tmp_path, mon
 def publish(publisher: Publisher, t_us: int) -> None:
     t = np.arange(t_us, t_us + 10)
     publisher.publish("events", t_us, Events.of(t, t % 1280, t % 720, t % 2))
+
+
+def test_who_has_asked_nothing_yet_is_left_at_the_end() -> None:
+    """Browsers open connections that they may need."""
+    with staged() as stage:
+        idle = socket.create_connection(("127.0.0.1", stage.view.port))
+        assert stage.ask("/")[0] == 403
+    with idle, suppress(ConnectionResetError):
+        idle.settimeout(30)
+        assert idle.recv(1) == b""
 
 
 def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
