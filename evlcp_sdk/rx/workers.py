@@ -159,7 +159,8 @@ class _Worker:
             raise WorkerError(
                 f"a frame has {total} bytes of events, a worker takes {_ROOM_BYTES}: use one core"
             )
-        begin = self._next if self._next + total <= _ROOM_BYTES else 0
+        # From the start again where nothing is open: so little of it is used, and stays in a cache.
+        begin = self._next if self._open and self._next + total <= _ROOM_BYTES else 0
         room = range(begin, begin + total)
         while any(begin < taken.stop and taken.start < room.stop for taken, _ in self._open):
             self._receive_oldest()
