@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from evlcp_barker import _kernels
-from evlcp_barker.bound import due_chips, least_correlation, preamble_share
+from evlcp_barker.bound import due_chips, guard_chips, least_correlation, preamble_share
 from evlcp_barker.pilots import Barker13Pilots
 from evlcp_barker.synchronization import BarkerSync
 from evlcp_wh.modulation import Wh4x2
@@ -168,6 +168,21 @@ def test_a_preamble_passes_and_other_codes_do_not(name, clusters):
     assert max(share for _, share in reached.values()) < 1e-3 or (clusters == 1 and least == most)
     if name in SLOW:
         assert least == pytest.approx(0.5 * preamble_share(book.preamble))
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_shifts_of_a_preamble_are_within_its_guard(name):
+    code = OWN[name]
+    dark = np.zeros(len(code) - 1, np.uint8)
+    counts = answers_of(np.concatenate([[0], code, dark, [0]])[:, None], slow=False)[:, 1 : len(code) + 1]
+    counts = np.pad(counts, [(0, 0), (len(code), len(code))])
+    lags = 2 * len(code) + 1
+    rho = correlate(counts, 2.0 * code - 1, due_chips(code), 1, 0, lags)
+    least = 0.5 * preamble_share(code)
+    guard = guard_chips(code, least)
+    away = np.abs(np.arange(lags) - len(code))
+    assert rho[away > guard].max() < least
+    assert guard == 3 or (rho[away == guard] >= least).any()
 
 
 def test_a_preamble_of_sparse_pulses_is_one_lock_a_packet():

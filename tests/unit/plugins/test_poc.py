@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from evlcp_centroid.ranging import CentroidRanging
 from evlcp_poc import _kernels
-from evlcp_poc.correlation import full_band, pair_shifts, phase_only_correlation
+from evlcp_poc.correlation import blob_band, full_band, pair_shifts, phase_only_correlation
 from evlcp_poc.ranging import PocRanging
 from numpy.testing import assert_allclose
 from scipy.stats import norm
@@ -130,6 +130,13 @@ def test_exact_shifts_are_recovered(samples, shape, most):
     # The images are float32: 3e-7 px were seen with the full band. The less band, the flatter the peak, and
     # the last step, below 1e-3 px, leaves more.
     assert_allclose(shifts, by[pairs[1]] - by[pairs[0]], atol=2e-6 if most is None else 2e-5)
+
+
+@pytest.mark.parametrize(("down", "across", "most"), [(12, 4, (2, 4)), (4, 40, (6, 1)), (0.5, 0.5, (23, 15))])
+def test_blobs_fill_half_a_cycle_a_blob_size(down, across, most):
+    """Never less than one harmonic, nor more than there are; a blob is a pixel at the least."""
+    blob = np.outer(box(24, down, 49), box(16, across, 33))
+    assert blob_band(np.float32(blob)[:, None], (48, 32)) == most
 
 
 def view_of(maps):
