@@ -131,3 +131,10 @@ def value(bits: np.ndarray) -> int:
 def test_published_check_values(polynomial: int, start: int, check: int) -> None:
     got = value(crc24(NINE, polynomial, start))
     assert got == check, hex(got)
+
+
+@pytest.mark.parametrize("bits", range(1, 18))
+def test_a_message_need_not_fill_its_bytes(bits: int) -> None:
+    """Zeros before it say nothing to a register of zeros."""
+    message = np.ones(bits, np.uint8)
+    assert value(crc24(message, start=0)) == value(crc24(np.pad(message, (-bits % 8, 0)), start=0))
