@@ -4,18 +4,15 @@ import json
 import re
 import signal
 import socket
-import subprocess
-import time
 from contextlib import nullcontext
 
 import pytest
 from board_lines import FatalLine, board_on, check_fault, some_bank, well
-from test_board_cli import EVLCP
 
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.monitor import Back, Gone, watch
 from firmware_host.board.session import Session
-from firmware_host.emulators.led_record import LedRecord
+from firmware_host.board.stream import Stream
 from firmware_host.errors import LineError, NoBoardError, VerifyError
 from firmware_host.ports.transport import SocketTransport
 from firmware_host.protocol.generated.requests import BoardFault, State, StatusReply, Watchdog
@@ -42,23 +39,6 @@ def test_a_host_that_stays_keeps_the_watchdog_still(device, board):
     assert board.status().requests == before.requests + 1
 
 
-def within(seconds, done):
-    end = time.monotonic() + seconds
-    while not done() and time.monotonic() < end:
-        time.sleep(0.01)
-    return done()
-
-
-def interrupted(command, begun):
-    """What a command says that is ended with Ctrl-C once it has begun; it ends well."""
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert within(60, begun)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=20)
-    assert (process.returncode, err) == (0, "")
-    return out
-
-
 def test_program_keeps_alive_until_it_is_ended(evlcp, monkeypatch):
     stays = iter([Board.start, Board.blank])
 
@@ -72,19 +52,17 @@ def test_program_keeps_alive_until_it_is_ended(evlcp, monkeypatch):
     assert done.err == "evlcp: native:: state dark, faults none\n"
 
 
-def has_sent(leds):
-    """Whether a packet has begun: no two chips of the idle pattern are alike."""
-    if leds.stat().st_size < 4_000:
-        return False
-    rows = LedRecord.read(leds).played().rows
-    return bool((rows[1:] == rows[:-1]).all(1).any())
+def test_ctrl_c_ends_the_stream_of_a_message(evlcp, native, monkeypatch):
+    send = Stream.send
 
+    def interrupted(stream, symbols):
+        signal.raise_signal(signal.SIGINT)
+        return send(stream, symbols)
 
-def test_ctrl_c_ends_the_stream_of_a_message(evlcp, native, tmp_path):
-    command = [*EVLCP, "tx", "message", "--text", "{n}", "--every", "60", "--port", native, "--json"]
-    told = json.loads(interrupted(command, lambda: has_sent(tmp_path / "leds.bin")))
+    monkeypatch.setattr(Stream, "send", interrupted)
+    done = well(evlcp("tx", "message", "--text", "{n}", "--every", 60, "--port", native, "--json"))
     status = json.loads(evlcp("board", "--port", native, "status", "--json").out)
-    assert (status["state"], status["packets_sent"]) == ("dark", told["packets"])
+    assert (status["state"], status["packets_sent"]) == ("dark", json.loads(done.out)["packets"])
     check_fault(evlcp("board", "--port", native, "start"), 5, "NOTHING_COMMITTED")
 
 

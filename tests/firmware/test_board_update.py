@@ -16,6 +16,7 @@ from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import BoardError, IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.protocol.generated import requests as protocol
 from firmware_host.protocol.generated.requests import BoardFault, State, Status
+from tests.models.usb import UsbLine
 
 
 def package(seed, count=400):
@@ -158,6 +159,22 @@ def test_what_is_interrupted_keeps_the_old_one_and_ends_well_later(device):
     assert (update_status(board).running, update_status(board).trial) == (1, 0)
     assert update(board, new).image == 2
     assert image_of(device, 2, 20_000) == new.images[2]
+
+
+class SlowLine(UsbLine):
+    """A line and a board that take two hundred times as long as they should."""
+
+    def now(self):
+        return 200 * super().now()
+
+    def read(self, timeout_s):
+        return super().read(timeout_s / 200)
+
+
+def test_a_slow_board_is_waited_for(device):
+    board = board_on(SlowLine(device, 0.0), latency_s=0.1)
+    done = update(board, package(3, 30_000))
+    assert (done.image, device.bench.running) == (1, 1)
 
 
 def test_a_file_of_an_update(tmp_path):
