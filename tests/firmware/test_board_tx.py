@@ -130,3 +130,10 @@ def test_a_flickering_payload_ends_with_one(evlcp):
     done = evlcp("tx", "check", "--random", 1, "--json", *one)
     rows = json.loads(done.out, parse_constant=pytest.fail)["clusters"]
     assert {row["limit_percent"] for row in rows} == {None}
+
+
+def test_codebook_packets_are_balanced_and_do_not_flicker(evlcp):
+    done = well(evlcp("tx", "check", "--random", 40, "--json"))
+    rows = json.loads(done.out)["clusters"]
+    assert len(rows) == 16
+    assert all(r["on_share"] == 0.5 and r["longest_run"] == 2 and r["low_risk"] for r in rows)

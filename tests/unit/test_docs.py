@@ -235,3 +235,18 @@ def test_every_name_of_the_face_that_a_page_shows_exists() -> None:
     for path in [*FILES, *(ROOT / "examples").glob("*.py")]:
         for name in re.findall(r"\bevlcp\.(\w+)", path.read_text()):
             assert name in evlcp_sdk.__all__, f"{path.name} names evlcp.{name}"
+
+
+def test_the_tree_of_contributing_is_the_tree() -> None:
+    text = next(text for text in blocks(ROOT / "CONTRIBUTING.md", "text") if "evlcp_sdk/errors.py" in text)
+    told = re.findall(r"^(\S+)  +\S", text, re.MULTILINE)
+    assert len(told) == len(text.splitlines())
+    for path in told:
+        found = ROOT / path
+        assert found.is_dir() if path.endswith("/") else found.is_file(), f"CONTRIBUTING.md: {path}"
+    rooms = {
+        f"evlcp_sdk/{path.name}{'/' * path.is_dir()}"
+        for path in (ROOT / "evlcp_sdk").iterdir()
+        if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert rooms == {path for path in told if path.startswith("evlcp_sdk/")}

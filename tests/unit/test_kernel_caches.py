@@ -14,6 +14,7 @@ import pytest
 from evlcp_sdk.kernels import COMPILING, njit
 from evlcp_sdk.stopwatch import Stopwatch
 from evlcp_sdk.warming import STEPS, Warmth, warm_up
+from tests.conftest import ROOT
 
 OWN = """
 import logging, sys
@@ -133,3 +134,11 @@ def test_the_command_says_what_it_did(evlcp, monkeypatch, warmth: Warmth, words:
     assert done.code == 0
     assert " ".join(done.out.split()).startswith(words)
     assert json.loads(evlcp("warm-up", "--json").out) == asdict(warmth)
+
+
+def test_every_kernel_is_compiled_in_this_way() -> None:
+    kernels = [path for room in ("evlcp_sdk", "plugins") for path in (ROOT / room).glob("**/_kernels.py")]
+    assert len(kernels) > 7
+    for path in kernels:
+        assert "from evlcp_sdk.kernels import njit\n" in path.read_text()
+        assert "from numba import" not in path.read_text()

@@ -108,3 +108,23 @@ def test_a_fault_of_ours_says_what_to_report_and_too_little_memory_is_none(
     assert done.err.startswith(first)
     assert all(part in done.err for part in parts)
     assert done.err.count("\n") == 1
+
+
+def test_the_entry_point_can_be_interrupted_from_the_start() -> None:
+    """What it imports before it can catch an interrupt is next to nothing."""
+    code = "import sys; import evlcp_sdk.cli.main; print(*sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert {name.removeprefix("evlcp_sdk") for name in said.split() if name.startswith("evlcp")} == {
+        *("", ".cli", ".cli.main", ".cli._complain", ".printable")
+    }
+    assert not {"typer", "rich", "typing", "pathlib", "logging"} & set(said.split())
+
+
+def test_without_a_home_libraries_say_nothing() -> None:
+    code = f"import sys; sys.argv = ['evlcp', '--help']\ntry: {MAIN}\nexcept SystemExit: pass\n"
+    code += "import matplotlib; matplotlib.get_cachedir()"
+    nowhere = dict.fromkeys(("HOME", "MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"), "/dev/null/none")
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ | nowhere
+    )
+    assert done.stderr == ""

@@ -306,3 +306,23 @@ def test_what_points_share_grows_with_the_whole_layout(layout, length_m, dark) -
     longest = math.hypot(0.05, 0.002 * 250 * length_m)
     assert np.linalg.eigvalsh(found.root)[-1] == pytest.approx(longest, rel=1e-9)
     assert found.survey == pytest.approx([0.1, 0.2, 0.005])
+
+
+def test_protection_levels_hold_with_any_bar_at_fault() -> None:
+    """The widest of what a bar that stands anywhere may hide, each told by its own test."""
+    p, position, rotation = problem(np.random.default_rng(12), 3, noise=1.0)
+    p = dataclasses.replace(p, spec=dataclasses.replace(p.spec, bar_fault_m=0.0))
+    fit = fitted(p, position, rotation)
+    found, spread = assess_fit(fit), fit.spread
+    assert isinstance(found, Pose)
+    risk = stats.chi2.isf(SPEC.risk, 1)
+    for b in range(3):
+        bars = fit.bars
+        column = bars.info[b, :, :6] * p.free[:, None]
+        own, side = bars.info[b, :6, :6], bars.right[b, :6]
+        value, freedom, added, unseen = _test(own, column, side, spread, np.zeros((6, 6)))
+        assert value == pytest.approx(found.tests[f"bar {b}"])
+        hidden = np.sqrt(stats.chi2.isf(SPEC.false_alarm / 2 / len(found.tests), freedom) * np.diag(unseen))
+        assert (found.hidden_m >= hidden * (1 - 1e-9)).all()
+        height_m = hidden[2] + math.sqrt(risk * (spread[2, 2] + added[2, 2]))
+        assert found.vpl_m >= height_m * (1 - 1e-9)

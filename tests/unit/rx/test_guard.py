@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from rx_streams import lit
 
-from evlcp_sdk.errors import ConfigError, InputError, PluginError
+from evlcp_sdk.errors import ConfigError, InputError, PluginError, PluginWarning
+from evlcp_sdk.io import open_source
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Corrected, Tracker
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Bend, SyncLock
@@ -202,3 +205,20 @@ def test_an_error_correction_that_gives_another_thing_is_named(gives, says):
     for compiled, told in ((compile_code, says), (lambda _: None, "TypeError: gave NoneType at compile")):
         with pytest.raises(PluginError, match=f"^error-correction algorithm 'mine': {told}"):
             received(link_with("error-correction", compiled))
+
+
+def test_hooks_that_exit_end_nothing(demo_raw):
+    class Exits:
+        @hookimpl
+        def evlcp_open_events(self, url):
+            raise SystemExit(0)
+
+        @hookimpl
+        def evlcp_stage_finished(self, stage):
+            raise SystemExit(0)
+
+    registry = Registry.load(Exits())
+    with pytest.raises(PluginError, match=r"^evlcp_stage_finished\(\) of a plugin: SystemExit: 0"):
+        Receiver(LINK, registry.hook).feed(EVENTS)
+    with pytest.warns(PluginWarning, match="evlcp_open_events.* fails: SystemExit: 0"):
+        open_source(demo_raw, registry).close()
