@@ -20,7 +20,7 @@ from board_lines import (
 from firmware_host.board.bank import Bank, bank_of
 from firmware_host.board.board import Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
-from firmware_host.errors import IncompatibleError, NoBoardError, RefusedError
+from firmware_host.errors import BoardResetError, IncompatibleError, NoBoardError, RefusedError
 from firmware_host.protocol.generated import requests as protocol
 from firmware_host.protocol.generated.requests import MAJOR, MINOR, BoardFault, State, Watchdog
 
@@ -183,3 +183,24 @@ def test_faults_show_and_darken_and_end_the_led_test(device, board):
     board.start()
     device.run(10_000)
     assert state_of(board) == (State.PLAYING, 0)
+
+
+def test_board_reset_at_any_moment():
+    bank, line, told = some_bank(12, 2), recording(playing()), []
+    provision(board_on(line, nonce=7), bank, Settings())
+    for moment in np.random.default_rng(8).integers(1, len(line.written), 14):
+        device = playing()
+        line = FatalLine(device, int(moment), lambda line: line.board.reset())
+        try:
+            provision(board_on(line, nonce=7), bank, Settings())
+        except BoardResetError as fault:
+            told.append(str(fault))
+        board = board_on(device)
+        if board.status().state == State.PLAYING:
+            assert board.holds(bank, board.status())
+        provision(board, bank, Settings())
+        assert board.holds(bank, board.status())
+        assert board.status().state == State.PLAYING
+    # a reset before HELLO arrives, or after the last request, goes unnoticed by right
+    assert len(told) > 9
+    assert all("was reset" in words and "run the command again" in words for words in told)

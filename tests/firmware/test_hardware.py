@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from docs.figures import hardware as bar
 
@@ -97,3 +98,16 @@ def test_dark_without_the_firmware():
     assert {pulls[net] for net in ("LE", "CLK", "SDI", "LEVEL", "GATE", "PULSE", "BOOT0", "BOOT1")} == {"GND"}
     # no level asks for a current with the pin at 0 V
     assert bar.led_ma(0) == 0.0
+
+
+def test_currents_and_light_by_formula():
+    assert bar.led_ma(60) == pytest.approx(1e3 * 15 * 1.25 / 316, rel=1e-3)
+    levels = [bar.led_ma(n) for n in range(61)]
+    assert levels == sorted(levels)
+    # beyond the beam's width each LED counts as if it stood in the middle
+    assert bar.irradiance(30.0, 0.04) == pytest.approx(96 * 0.04 / 30**2, rel=1e-2)
+    worst, code = bar.eye(59.3, 1.0), bar.eye(59.3, 0.5)
+    for eye in (worst, code):
+        assert eye.radiance < eye.radiance_limit
+        assert eye.corneal < eye.corneal_limit
+    assert worst.radiance == pytest.approx(0.07 * 0.593 / (0.3e-3) ** 2 * 10 ** (-130 / 500))
