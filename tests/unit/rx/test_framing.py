@@ -11,7 +11,7 @@ from rx_streams import LINK, frames_of, lit, noise_events, received
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.alignment import polarity_sums
 from evlcp_sdk.rx.transmitters import PacketGrid, RowDelay, measure_row_delay
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, SyncLock
 
 CHIP_US, ZERO_US = 100.5, 1234.5
@@ -130,6 +130,15 @@ def test_rows_that_are_read_late(row_us):
     got, sigma = measured(read_late(EVENTS, row_us))
     assert got == pytest.approx(row_us, abs=max(0.01, 3 * sigma))
     assert sigma < 0.01
+
+
+def test_hidden_rows_and_noise_are_outliers():
+    events = read_late(EVENTS, 0.2)
+    hidden = (events.y > 300) & (events.y < 350)
+    early = (events.y > 400) & (events.y < 425)
+    moved = Events.of(events.t_us - 60 * early, events.x, events.y, events.p)[~hidden]
+    noisy = merged(moved, noise_events(2e6, 90_000))
+    assert measured(noisy)[0] == pytest.approx(0.2, abs=0.03)
 
 
 @pytest.mark.parametrize("events", [Events.empty(), EVENTS[:3], noise_events(1e8, 30_000)])

@@ -154,6 +154,8 @@ def spoilt(name, value, kind=None):
 ODD = [
     ("synchronization", lambda _: (0.0, 100.0), "tuple, expected SyncLock"),
     ("synchronization", but(chip_us=-100.0), r"chip_us = -100\.0, expected a number from 50 to 200"),
+    ("synchronization", but(packet_t_us=-1e15), r"packet_t_us = -1000000000000000\.0, expected"),
+    ("synchronization", but(delay_on_us=math.inf), "delay_on_us = inf, expected"),
     ("synchronization", but(quality=2.0), r"quality = 2\.0, expected a number from 0 to 1"),
     ("separation", lambda _: None, "NoneType, expected PresenceMap"),
     ("separation", but(grid_px=10**6), r"probability of shape \(16, \d+, \d+\), expected \(16, 0, 0\)"),
@@ -163,6 +165,7 @@ ODD = [
     ("separation", but(prior=np.zeros(3)), r"prior of shape \(3,\), expected"),
     ("separation", spoilt("pixels", math.inf), "pixels of other values, expected finite ones"),
     ("separation", spoilt("selected", 1, np.int64), "selected of int64, expected booleans"),
+    ("separation", lambda p: replace(p, pixels=p.pixels[:, 1:]), r"pixels of shape"),
     ("decoding", lambda _: "text", "str, expected SoftSymbols"),
     ("decoding", but(symbols=np.zeros(3, int)), r"symbols of shape \(3,\), expected \(16,\)"),
     ("decoding", spoilt("symbols", -2), "symbol -2, expected 0 to 63, or -1 for one not given"),
