@@ -144,7 +144,8 @@ def diagnose(
     wrong = any(one.verdict == "fail" or one.code in ("codewords", "unsure") for one in checks)
     if wrong and not facts.at_edge:
         trials = tuple(_trials(seen, sources, link, registry))
-        checks = find_stages(replace(facts, trials=trials))
+        inverted = not any(one.fits for one in trials) and try_link(link, _inverted(seen.sample)).fits
+        checks = find_stages(replace(facts, trials=trials, inverted=inverted))
     return Diagnosis(
         name,
         _headline(checks, seen.tally),
@@ -180,8 +181,7 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
 
 def _trials(seen: "_Pass", sources: Sequence[LightSource], link: Link, registry: Registry) -> Iterator[Trial]:
     """What links make of a recording, the one given first."""
-    sample, fits = Events.concat(seen.pieces)[:MOST_EVENTS], False
-    short = sample[: int(np.searchsorted(sample.t_us - sample.t_us[:1], _TRIAL_US))]
+    sample, short, fits = Events.concat(seen.pieces)[:MOST_EVENTS], seen.sample, False
     # What else a link may be is tried of packets that begin with a preamble only.
     if "preambles" in seen.receiver.counts and sources:
         for trial in better_links(link, short, registry, _rates(sources, link)):
@@ -192,6 +192,11 @@ def _trials(seen: "_Pass", sources: Sequence[LightSource], link: Link, registry:
     if len(sample) and not fits:
         lights = [sample[inside(sample, one.box_px)] for one in sources[:_LIGHTS]]
         yield from infer_links(link, lights or [sample], registry)
+
+
+def _inverted(events: Events) -> Events:
+    """Events with their polarities exchanged."""
+    return Events(events.t_us, events.x, events.y, 1 - events.p)
 
 
 class _Pass:
@@ -231,6 +236,12 @@ class _Pass:
         long_us = self.pieces[-1].t_us[-1] - self.pieces[0].t_us[0] if self.pieces else 0
         long_enough_us = _TRIAL_US if self.begun else _LIGHT_US
         return sum(map(len, self.pieces)) >= MOST_EVENTS or bool(long_us > long_enough_us)
+
+    @property
+    def sample(self) -> Events:
+        """The events that other links are tried on."""
+        first = Events.concat(self.pieces)[:MOST_EVENTS]
+        return first[: int(np.searchsorted(first.t_us - first.t_us[:1], _TRIAL_US))]
 
 
 def _rates(sources: Sequence[LightSource], link: Link) -> list[float]:

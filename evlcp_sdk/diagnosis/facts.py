@@ -124,6 +124,7 @@ class Facts:
         restless: Box of where far more happens than elsewhere, px; None for nowhere.
         speed_px_ms: How fast light sweeps over the image, px/ms; 0 where it does not.
         trials: Links that were tried, the one given first.
+        inverted: Whether the link fits if ON and OFF are exchanged, and no other does.
     """
 
     link: Link
@@ -147,6 +148,7 @@ class Facts:
     restless: tuple[int, int, int, int] | None = None
     speed_px_ms: float = 0.0
     trials: Sequence[Trial] = ()
+    inverted: bool = False
 
     @property
     def duration_us(self) -> float:

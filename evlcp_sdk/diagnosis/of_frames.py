@@ -91,7 +91,10 @@ def check_frames(facts: Facts) -> Found:
     share = _REJECTED_SHARE
     if facts.blocks_read > counts.get("blocks_failed", 0):
         share = _REJECTED_BESIDE_READ_SHARE
-    if not reads and better is not None:
+    if facts.inverted:
+        step = "list:PATH?inverted=1 turns the polarities of a list; else exchange them where it is written"
+        yield Diagnostic("polarity", f"{text}; all fit where ON and OFF are exchanged", step)
+    elif not reads and better is not None:
         with_it = f"{better.frames} of {better.frames + better.rejected} by another link"
         yield Diagnostic("link", f"{text}, {with_it}", better.options())
     elif facts.at_edge and (not reads or unseen > _UNSEEN_SHARE):

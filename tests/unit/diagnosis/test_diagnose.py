@@ -19,7 +19,7 @@ from evlcp_sdk.diagnosis.diagnose import Diagnosis, diagnose, infer_link
 from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.diagnosis.light import LightSource, LightSurvey
 from evlcp_sdk.diagnosis.tallies import RunTally, TransmitterTally
-from evlcp_sdk.io.open import write_events
+from evlcp_sdk.io.open import read_events, write_events
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.run import receive_to_folder
@@ -295,6 +295,15 @@ def test_picture_upside_down_is_noticed(tmp_path: Path) -> None:
     diagnosis = diagnose(written(tmp_path, turned=True), LINK)
     assert code_of(diagnosis) == "turned"
     assert diagnosis.counts["frames_rejected"] == 0
+
+
+def test_polarities_that_are_exchanged_are_found(tmp_path: Path, demo_raw: Path) -> None:
+    events = read_events(demo_raw)
+    np.savez(tmp_path / "a.npz", t=events.t_us, x=events.x, y=events.y, p=1 - events.p)
+    diagnosis = diagnose(tmp_path / "a.npz", LINK)
+    assert code_of(diagnosis) == "polarity"
+    assert "all fit where ON and OFF are exchanged" in diagnosis.headline
+    assert code_of(diagnose(f"list:{tmp_path / 'a.npz'}?inverted=1", LINK)) == ""
 
 
 def test_a_recording_without_events_fails_once(tmp_path: Path) -> None:
