@@ -193,6 +193,18 @@ def test_what_no_next_stage_can_work_with_is_named(role, change, says):
 
 
 @pytest.mark.parametrize(
+    ("role", "change"),
+    [
+        ("synchronization", but(chip_us=np.float32(100.0))),
+        ("decoding", lambda soft: replace(soft, symbols=soft.symbols.astype(np.int16))),
+        ("ranging", but(distance_m=math.nan, sigma_m=math.nan, pairs=0)),
+    ],
+)
+def test_other_types_of_right_values_pass(role, change):
+    received(changed(role, change))
+
+
+@pytest.mark.parametrize(
     ("gives", "says"),
     [
         (None, "TypeError: gave NoneType, expected Corrected"),
