@@ -300,6 +300,16 @@ def test_packets_behind_another_pause_than_is_stated_are_whole(extra):
     assert tally.transmitters[0].clock_ppm() == pytest.approx(-1000, abs=100)
 
 
+def test_a_long_pause_has_no_characters():
+    """In its noise, and the light is found again behind it."""
+    rng = np.random.default_rng(1)
+    first, second = rng.integers(0, 128, (2, 60))
+    words = [levels_of(one, 7, "even", 2) for one in (first, second)]
+    events = seen(rng, [*words[0], *[1] * 6000, *words[1]], 320.0)
+    found = read_characters(events.t_us, events.p, 3125.0, Uart(7, "even", 2))
+    assert [c.value for c in found] == [*first, *second]
+
+
 def test_a_bar_of_clusters_is_refused():
     with pytest.raises(ConfigError, match="framing 'uart': a bar of 16 clusters, expected one"):
         resolve({"framing": {"id": "uart"}})
@@ -357,6 +367,21 @@ def test_a_light_the_other_way_round_is_read(data_bits, parity, stop_bits, bit_h
     state, more = decoder.close(state)
     assert [c.value for c in found + more] == sent.tolist()
     assert state.given["frames_inverted"] == (len(sent) if (idle == "on") != mark_on else 0)
+
+
+@pytest.mark.parametrize("clock", [-0.025, 0.02])
+def test_a_text_is_read_from_its_first_stretch_on_whatever_the_clock(clock):
+    """A few characters follow the part that is learned from, and fit from another bit on, too."""
+    text = b"rag thou wander'st in his shade, When in eternal lines to time thou grow'st: So long as men can "
+    sent = np.frombuffer(text + b"brea", np.uint8).astype(np.int64)
+    levels = levels_of(sent, 7, "even", 2, True)
+    rng = np.random.default_rng(1001)
+    rng.integers(0, 500)
+    bit_us, cut = 320 * (1 + clock), float(rng.uniform(0, 11))
+    light = seen(rng, levels, bit_us, events=(14.0, 11.0), unseen=0.001, cut_bits=cut)
+    found = read_characters(light.t_us, light.p, 3125.0, Uart(7, "even", 2, first_bit="highest"))
+    assert found[0].bit_us == pytest.approx(bit_us, rel=1e-3)
+    assert wrong_bits([one.value for one in found[-98:]], sent[-98:].tolist(), 7) < 0.01
 
 
 def test_what_a_list_has_wrong_is_said(tmp_path, evlcp):
