@@ -312,6 +312,7 @@ BROKEN = {
             ranging(changed(distance_m=lambda d: d + np.random.random())),  # noqa: NPY002
             "the same result when called again",
         ),
+        ("deterministic", ranging(before(lambda _: np.random.random())), "take a Generator"),  # noqa: NPY002
     ],
     "pilots": [
         ("shapes", Changed(WhPilots(), "codes", lambda codes: codes.astype(float)), "uint8"),
@@ -334,6 +335,7 @@ BROKEN = {
     ],
     "detection": [
         ("shapes", detection(giving(lambda regions: [*regions, *regions])), "regions of different ids"),
+        ("shapes", detection(giving(lambda regions: [])), "a region in a recording"),
         ("state-kept", detection(grown), "not to change the state"),
     ],
     "framing": [
@@ -354,6 +356,7 @@ BROKEN = {
             locks_changed(lambda lock: replace(lock, packet_t_us=lock.packet_t_us + 70)),
             "to half a chip",
         ),
+        ("finds-time", locks_changed(lambda lock: replace(lock, chip_us=1.0001 * lock.chip_us)), "58 ppm"),
         ("finds-time", sync(lambda inner, state, *given: (state, [])), "one lock a packet"),
         ("any-split", sync(amnesic), "the same locks from events fed"),
         ("state-kept", sync(mutating), "not to change the state"),
@@ -390,8 +393,12 @@ BROKEN = {
         ("clean-link", smoothing(off_m=10.0), "filtered 54.01 m within 5%"),
     ],
     "error-correction": [
+        ("shapes", code_changed(coded=lambda x: x.astype(int)), "coded bits as a uint8 array"),
+        ("shapes", code_changed(found=lambda f: replace(f, flipped=np.int64(0))), "flipped as an int"),
+        ("shapes", code_changed(llr=lambda x: np.resize(x, 960)), "ConfigError from decode"),
         ("shapes", code_changed(coded=lambda x: x[:-1]), r"coded bits of shape \(960,\)"),
         ("comes-back", code_changed(found=lambda f: replace(f, bits=f.bits ^ 1)), "bits wrong"),
+        ("comes-back", code_changed(found=lambda f: replace(f, flipped=1)), "no bit flipped"),
         ("every-bit", code_changed(bits=lambda x: np.append(x[:1] * 0, x[1:])), "message bit 0 of 456"),
         ("knows-nothing", code_changed(found=lambda f: replace(f, ok=True)), "not ok where none of 960"),
         ("no-message-in-noise", code_changed(found=GULLIBLE), "no message in random LLRs"),
@@ -401,6 +408,7 @@ BROKEN = {
             code_changed(found=lambda f: replace(f, ok=f.ok and not f.flipped)),
             "the message with 9 of 960 bits wrong",
         ),
+        ("corrects", code_changed(found=lambda f: replace(f, flipped=0)), "9 flipped with 9 of 960"),
         ("clean-link", code_changed(llr=lambda x: x[::-1]), "message 0 of a clean recording"),
     ],
 }
