@@ -396,6 +396,7 @@ def test_a_car_surveys_a_new_bar_on_its_way(evlcp: Evlcp, street: Path, tmp_path
     assert bar.transmitter_id == bars[1].transmitter_id
     error = LocalAxes.of([bars[1]]).to_enu(bar.latitude_deg, bar.longitude_deg, bar.height_m)
     assert error @ np.linalg.solve(told["covariance_m2"], error) < 20
+    assert told["views"] == 7
     assert 0.01 < bar.position_sigma_m < 0.5
     for given in ((), ("--poses", "x.csv", "--sites", one), ("--poses", "x.csv", "--gnss", "x.csv")):
         assert evlcp("survey", street / "rec.raw", "-o", new, *given).code == 2
