@@ -196,7 +196,7 @@ class LiveLoop:
             self._shedder.drop(piece.events)
             piece, pieces = newer, [newer]
         events = len(piece.events)
-        while events < _TURN_EVENTS and taken_s - piece.arrived_s > 1e-3 * _TURN_US / 8:
+        while events < _TURN_EVENTS and taken_s - piece.arrived_s > 1e-6 * _TURN_US / 8:
             more = self._reader.take(0.0)
             if more is None:
                 break

@@ -24,9 +24,10 @@ from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.live import Budget, LiveStatus, Publisher, Subscription
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.run import live, receive
+from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events
 from evlcp_sdk.utc import PulseClock
-from evlcp_sdk.values import Events, Triggers
+from evlcp_sdk.values import Events, Packet, Triggers
 from tests.unit.live.helpers import PATIENT, dies, key, sender
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
@@ -162,9 +163,17 @@ def test_what_there_is_no_time_for_is_left_out_and_counted(demo_raw: Path) -> No
 
 
 def test_slices_that_wait_are_taken_together_and_nothing_is_left_out(demo_raw: Path, monkeypatch) -> None:
-    monkeypatch.setattr("evlcp_sdk.live.loop._TURN_US", 400)
+    taken, feed = [], Receiver.feed
+
+    def counted(self: Receiver, events: Events) -> list[Packet]:
+        taken.append(len(events))
+        return feed(self, events)
+
+    monkeypatch.setattr(Receiver, "feed", counted)
     mine = (publisher := Publisher()).subscribe({"frame"}, most=100_000)
     live(Burst(demo_raw), publisher=publisher, budget=PATIENT, warm=False)
+    # A slice has 2000 events.
+    assert max(taken) > 4000
     assert [key(f) for f in gathered(mine)["frame"]] == [key(f) for p in receive(demo_raw) for f in p.frames]
 
 
