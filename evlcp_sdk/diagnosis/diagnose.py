@@ -143,8 +143,9 @@ def diagnose(
     trials: tuple[Trial, ...] = ()
     wrong = any(one.verdict == "fail" or one.code in ("codewords", "unsure") for one in checks)
     if wrong and not facts.at_edge:
-        trials = tuple(_trials(seen, sources, link, registry))
-        inverted = not any(one.fits for one in trials) and try_link(link, _inverted(seen.sample)).fits
+        sample = seen.sample
+        trials = tuple(_trials(seen, sample, sources, link, registry))
+        inverted = not any(one.fits for one in trials) and try_link(link, _inverted(_short(sample))).fits
         checks = find_stages(replace(facts, trials=trials, inverted=inverted))
     return Diagnosis(
         name,
@@ -176,12 +177,14 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
         if seen.begun and seen.full:
             break
     sources, _ = seen.survey.found()
-    return sorted(_trials(seen, sources, link, registry), key=lambda one: one.rank, reverse=True)
+    return sorted(_trials(seen, seen.sample, sources, link, registry), key=lambda one: one.rank, reverse=True)
 
 
-def _trials(seen: "_Pass", sources: Sequence[LightSource], link: Link, registry: Registry) -> Iterator[Trial]:
-    """What links make of a recording, the one given first."""
-    sample, short, fits = Events.concat(seen.pieces)[:MOST_EVENTS], seen.sample, False
+def _trials(
+    seen: "_Pass", sample: Events, sources: Sequence[LightSource], link: Link, registry: Registry
+) -> Iterator[Trial]:
+    """What links make of a recording, by a sample of it; the one given first."""
+    short, fits = _short(sample), False
     # What else a link may be is tried of packets that begin with a preamble only.
     if "preambles" in seen.receiver.counts and sources:
         for trial in better_links(link, short, registry, _rates(sources, link)):
@@ -192,6 +195,11 @@ def _trials(seen: "_Pass", sources: Sequence[LightSource], link: Link, registry:
     if len(sample) and not fits:
         lights = [sample[inside(sample, one.box_px)] for one in sources[:_LIGHTS]]
         yield from infer_links(link, lights or [sample], registry)
+
+
+def _short(sample: Events) -> Events:
+    """The start of a sample, some packets of a bar."""
+    return sample[: int(np.searchsorted(sample.t_us - sample.t_us[:1], _TRIAL_US))]
 
 
 def _inverted(events: Events) -> Events:
@@ -240,8 +248,7 @@ class _Pass:
     @property
     def sample(self) -> Events:
         """The events that other links are tried on."""
-        first = Events.concat(self.pieces)[:MOST_EVENTS]
-        return first[: int(np.searchsorted(first.t_us - first.t_us[:1], _TRIAL_US))]
+        return Events.concat(self.pieces)[:MOST_EVENTS]
 
 
 def _rates(sources: Sequence[LightSource], link: Link) -> list[float]:

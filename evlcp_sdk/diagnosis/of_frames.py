@@ -81,6 +81,10 @@ _FAILED_SHARE = 0.5
 """Packets that cannot be read, where others can, of which more is said."""
 
 
+_TURN_LIST = "list:PATH?inverted=1 turns the polarities of a list"
+"""What to try where ON and OFF may be exchanged."""
+
+
 def check_frames(facts: Facts) -> Found:
     """Frames that are due and are not there: of another link, of a bar at the edge, or of another bar."""
     counts, better, reads = facts.counts, facts.better, facts.reads or not facts.surveyed
@@ -92,7 +96,7 @@ def check_frames(facts: Facts) -> Found:
     if facts.blocks_read > counts.get("blocks_failed", 0):
         share = _REJECTED_BESIDE_READ_SHARE
     if facts.inverted:
-        step = "list:PATH?inverted=1 turns the polarities of a list; else exchange them where it is written"
+        step = f"{_TURN_LIST}; else exchange them where it is written"
         yield Diagnostic("polarity", f"{text}; all fit where ON and OFF are exchanged", step)
     elif not reads and better is not None:
         with_it = f"{better.frames} of {better.frames + better.rejected} by another link"
@@ -104,13 +108,13 @@ def check_frames(facts: Facts) -> Found:
             "turn the camera so that the whole bar is in the picture",
         )
     elif not reads or (rejected >= FEW_FRAMES and rejected > share * (frames + rejected)):
-        step = "compare the link's [bar], [pilots] and [air] with the transmitter's, or try --link auto;"
-        step += " list:PATH?inverted=1 turns the polarities of a list"
+        step = "compare the link's [bar], [pilots] and [air] with the transmitter's, or try --link auto"
         yield Diagnostic(
             "frames-rejected",
             f"{rejected} of {frames + rejected} frames rejected, as their clusters do not stand where the bar"
             " has them",
-            step if facts.surveyed else f"{step}; `evlcp diagnose` looks further",
+            # A diagnosis has tried the latter.
+            step if facts.surveyed else f"{step}; {_TURN_LIST}; `evlcp diagnose` looks further",
         )
     else:
         yield text

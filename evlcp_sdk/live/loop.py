@@ -32,6 +32,8 @@ _IDLE_S: Final = 0.05
 _TURN_EVENTS: Final = 1 << 16
 _TURN_US: Final = 8_000
 """How much is taken at once where slices wait."""
+_WAITED_S: Final = 1e-3
+"""How long one has waited before those behind it are taken with it: a slice of a camera that keeps up."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +198,7 @@ class LiveLoop:
             self._shedder.drop(piece.events)
             piece, pieces = newer, [newer]
         events = len(piece.events)
-        while events < _TURN_EVENTS and taken_s - piece.arrived_s > 1e-6 * _TURN_US / 8:
+        while events < _TURN_EVENTS and taken_s - piece.arrived_s > _WAITED_S:
             more = self._reader.take(0.0)
             if more is None:
                 break

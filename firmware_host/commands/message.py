@@ -193,7 +193,7 @@ def message(
     if anew.every is not None:
         if out is not None or chips is not None:
             raise ConfigError("--every sends what changes, to a board: -o and --chips hold what stays")
-        _send_anew(made, link, board.line(), repeat, anew.every, anew, as_json=as_json)
+        _send_anew(made, link, board.line(), repeat, anew, as_json=as_json)
         return
     symbols, summary = _compose(made, link, repeat)
     table = symbols_table(symbols, link, messages=True)
@@ -244,7 +244,6 @@ def _send_anew(
     link: Link,
     line: BoardLine | None,
     repeat: int,
-    every_s: float,
     anew: AnewOptions,
     *,
     as_json: bool,
@@ -256,14 +255,15 @@ def _send_anew(
     from evlcp_sdk.signals import stop_on_request
     from firmware_host.board.messages import check_interval, send_anew
 
+    assert anew.every is not None
     if line is None:
         raise ConfigError("--every sends to a board: give --port (or EVLCP_PORT)")
     # What is wrong is known before the board waits for it.
-    check_interval(content, link, repeat, every_s)
+    check_interval(content, link, repeat, anew.every)
     with line.open() as board:
         stream = board.stream(link, anew.ahead)
         with suppress(KeyboardInterrupt), stop_on_request() as stopped, stream:
-            send_anew(stream, content, link, repeat, every_s, anew.count, stopped)
+            send_anew(stream, content, link, repeat, anew.every, anew.count, stopped)
     say_stream(stream, as_json)
 
 
