@@ -66,14 +66,14 @@ class World:
 
     Attributes:
         bars: How many.
-        told: What is known of the attitude: "none", "gravity" or "heading".
+        attitude: What is known of the attitude: "none", "gravity" or "heading".
         survey: Sigmas of each bar's place, m, turn, radians, and length, a share.
         focal: Of the focal length, as a share.
         attitude_deg: Of pitch, roll and heading each.
     """
 
     bars: int
-    told: str
+    attitude: str
     survey: tuple[float, float, float] = (0.0, 0.0, 0.0)
     focal: float = 0.0
     attitude_deg: float = 0.1
@@ -99,18 +99,18 @@ def own_shift(points_px: Floats, spec: ErrorModel) -> Floats:
     return spec.shared_sigma_px * np.eye(2) + (longways - spec.shared_sigma_px) * np.outer(along, along)
 
 
-def uneven(points_px: Floats) -> Floats:
+def across_scale(points_px: Floats) -> Floats:
     """What makes even errors of points `ACROSS` as large across the bar, float64 (2, 2)."""
     along = points_px[-1] - points_px[0]
     along = along / np.linalg.norm(along)
     return ACROSS * np.eye(2) + (1 - ACROSS) * np.outer(along, along)
 
 
-def told_attitude(world: World, pitch_deg: float, roll_deg: float, heading_deg: float) -> Attitude | None:
+def measured_attitude(world: World, pitch_deg: float, roll_deg: float, heading_deg: float) -> Attitude | None:
     """What is known of an attitude, of which this is measured."""
-    if world.told == "none":
+    if world.attitude == "none":
         return None
-    heading = heading_deg if world.told == "heading" else None
+    heading = heading_deg if world.attitude == "heading" else None
     return Attitude(pitch_deg, roll_deg, heading, world.attitude_deg, world.attitude_deg)
 
 
@@ -121,48 +121,48 @@ def scene(world: World, rng: np.random.Generator) -> Scene:
     focal_mm = CAMERA.focal_mm * (1 + world.focal * rng.normal())
     true = replace(CAMERA, focal_mm=focal_mm)
     depth = rng.uniform(30, 90)
-    views, shaken = [], rng.normal(0, SPEC.shaken_sigma_px, 2)
+    views, vibration_px = [], rng.normal(0, SPEC.shaken_sigma_px, 2)
     # Thirds of the image's width, so that no two bars cover each other.
     slots = rng.permutation(3)[: world.bars]
     for number, slot in enumerate(slots):
         far = depth * rng.uniform(0.8, 1.0)
-        sight = np.array([(slot - 1) * 0.055 + rng.uniform(-0.02, 0.02), rng.uniform(-0.025, 0.025), 1.0])
-        lean = rng.normal(0, 0.02, 2)
-        axis = np.array([*lean, 1.0]) / math.sqrt(1 + lean @ lean)
-        stands = rotation @ (sight * far) + ALONG[:, None] * axis
+        ray = np.array([(slot - 1) * 0.055 + rng.uniform(-0.02, 0.02), rng.uniform(-0.025, 0.025), 1.0])
+        tilt = rng.normal(0, 0.02, 2)
+        axis = np.array([*tilt, 1.0]) / math.sqrt(1 + tilt @ tilt)
+        stands = rotation @ (ray * far) + ALONG[:, None] * axis
         points, _ = project_bars(stands, np.zeros(3), rotation, true)
         shift = own_shift(points, SPEC) @ rng.normal(size=2)
-        points = points + rng.normal(0, POINT_PX, points.shape) @ uneven(points) + shift + shaken
+        points = points + rng.normal(0, POINT_PX, points.shape) @ across_scale(points) + shift + vibration_px
         place, turn, length = world.survey
         arm = stands - stands.mean(0)
-        said = stands + rng.normal(0, place, 3) + np.cross(rng.normal(0, turn, 3), arm)
-        said = said + rng.normal(0, math.hypot(length, SPEC.stretch_share)) * arm
+        stated = stands + rng.normal(0, place, 3) + np.cross(rng.normal(0, turn, 3), arm)
+        stated = stated + rng.normal(0, math.hypot(length, SPEC.stretch_share)) * arm
         sigma_px = np.full(16, POINT_PX)
-        views.append(BarView(number, said, points, sigma_px, world.survey, PIXEL_PX, across=ACROSS))
+        views.append(BarView(number, stated, points, sigma_px, world.survey, PIXEL_PX, across=ACROSS))
     off = rng.normal(0, world.attitude_deg, 3)
-    told = told_attitude(world, pitch + off[0], roll + off[1], (heading + off[2]) % 360)
+    attitude = measured_attitude(world, pitch + off[0], roll + off[1], (heading + off[2]) % 360)
     sigma = CameraSigma(focal_mm=world.focal * CAMERA.focal_mm)
-    return Scene(views, told, CAMERA, sigma, rotation)
+    return Scene(views, attitude, CAMERA, sigma, rotation)
 
 
 Fault = Callable[[Scene, np.random.Generator], None]
 
 
-def moved(bar: Scene, rng: np.random.Generator) -> None:
-    """A bar stands half a metre from where it is said to, in any direction."""
+def move_bar(bar: Scene, rng: np.random.Generator) -> None:
+    """A bar stands half a metre from where its site states, in any direction."""
     i = int(rng.integers(len(bar.views)))
     way = rng.normal(size=3)
     view = bar.views[i]
     bar.views[i] = replace(view, enu_m=view.enu_m + 0.5 * way / np.linalg.norm(way))
 
 
-def swapped(bars: Scene, _rng: np.random.Generator) -> None:
+def swap_sites(bars: Scene, _rng: np.random.Generator) -> None:
     """The first two sites are exchanged."""
     one, two = bars.views[:2]
     bars.views[:2] = [replace(one, enu_m=two.enu_m), replace(two, enu_m=one.enu_m)]
 
 
-def refocused(lens: Scene, rng: np.random.Generator) -> None:
+def change_focal_length(lens: Scene, rng: np.random.Generator) -> None:
     """The focal length is half a percent off."""
     share = 1 + WRONG_FOCAL * rng.choice([-1, 1])
     lens.camera = replace(lens.camera, focal_mm=lens.camera.focal_mm * share)
@@ -172,34 +172,34 @@ Off = Callable[[int, np.random.Generator], Floats]
 """By how much as many angles as are known - pitch, roll, heading - are off, degrees, float64 (3,)."""
 
 
-def turned(known: int, rng: np.random.Generator) -> Floats:
+def turn_one_angle(known: int, rng: np.random.Generator) -> Floats:
     """One of the attitude's angles is off by 1 degree."""
     off = np.zeros(3)
     off[int(rng.integers(known))] = rng.choice([-1.0, 1.0])
     return off
 
 
-def late(_known: int, rng: np.random.Generator) -> Floats:
+def delay_attitude(_known: int, rng: np.random.Generator) -> Floats:
     """The attitude is 10 ms old: a car's pitch and heading change by up to 20 and 45 degrees a second."""
     return np.asarray(rng.uniform(-1, 1, 3) * np.array([0.2, 0.2, 0.45]))
 
 
-def askew(by: Off) -> Fault:
+def turn_attitude(by: Off) -> Fault:
     """The attitude is off."""
 
     def turn(imu: Scene, rng: np.random.Generator) -> None:
-        if (told := imu.attitude) is None:
+        if (old := imu.attitude) is None:
             return
-        off = by(2 if told.heading_deg is None else 3, rng)
-        heading = None if told.heading_deg is None else (told.heading_deg + off[2]) % 360
+        off = by(2 if old.heading_deg is None else 3, rng)
+        heading = None if old.heading_deg is None else (old.heading_deg + off[2]) % 360
         imu.attitude = replace(
-            told, pitch_deg=told.pitch_deg + off[0], roll_deg=told.roll_deg + off[1], heading_deg=heading
+            old, pitch_deg=old.pitch_deg + off[0], roll_deg=old.roll_deg + off[1], heading_deg=heading
         )
 
     return turn
 
 
-def known_by_points(seen: Scene) -> Floats:
+def point_information(seen: Scene) -> Floats:
     """Information of all points on the camera's place, m, and turn, radians, and on a share of its focal
     length that is wrong, in `WRONG_FOCAL`: float64 (7, 7).
 
@@ -223,7 +223,7 @@ def known_by_points(seen: Scene) -> Floats:
         own[:, :, 2] = math.hypot(length, SPEC.stretch_share) * np.einsum("nij,nj->ni", by, arm)
         own[:, :, 3:6] = place * by
         own[:, :, 6:] = turn * np.cross(arm[:, None], by)
-        parts.append((np.linalg.inv(uneven(view.points_px)) @ rows * weight).reshape(-1, 6 + shared))
+        parts.append((np.linalg.inv(across_scale(view.points_px)) @ rows * weight).reshape(-1, 6 + shared))
     rows = np.concatenate(parts)
     whole = rows.T @ rows
     whole[7:, 7:] += np.eye(shared - 1)
@@ -238,12 +238,12 @@ def floor(seen: Scene, off_deg: Floats | None, world: World, alarms: tuple[float
     sigmas, and independent of the position's error, which is off by `moved`. Both for each of `alarms`.
 
     Args:
-        seen: What is seen, and said of the camera.
+        seen: What is seen, and stated of the camera.
         off_deg: By how much the angles are off; None: the focal length is, by `WRONG_FOCAL`.
         world: What is known.
         alarms: Chances of a false alarm.
     """
-    known = {"none": 0, "gravity": 2, "heading": 3}[world.told]
+    known = {"none": 0, "gravity": 2, "heading": 3}[world.attitude]
     step, by_turn = 1e-5, np.zeros((known, 6))
     for k, axis in enumerate(np.eye(3) * step):
         one, two = (
@@ -253,7 +253,7 @@ def floor(seen: Scene, off_deg: Floats | None, world: World, alarms: tuple[float
         change = [one.pitch_deg - two.pitch_deg, one.roll_deg - two.roll_deg]
         change.append(((one.heading_deg or 0) - (two.heading_deg or 0) + 180) % 360 - 180)
         by_turn[:, 3 + k] = np.radians(change)[:known] / (2 * step) / math.radians(world.attitude_deg)
-    points = known_by_points(seen)
+    points = point_information(seen)
     spread = np.linalg.inv(points[:6, :6] + by_turn.T @ by_turn)
     if off_deg is None:
         follow = spread @ points[:6, 6]
@@ -279,10 +279,10 @@ def floors(fixes: int) -> None:
     print("|---|---|---|---|---|")
     for what, by in {REFOCUSED: None, **ATTITUDES}.items():
         for name, world in WORLDS.items():
-            if by is not None and world.told == "none":
+            if by is not None and world.attitude == "none":
                 continue
             rng = np.random.default_rng(0)
-            known = 3 if world.told == "heading" else 2
+            known = 3 if world.attitude == "heading" else 2
             found = []
             for _ in range(fixes):
                 seen = scene(world, rng)
@@ -373,18 +373,18 @@ def drive(world: World, rng: np.random.Generator, spec: ErrorModel) -> tuple[lis
     rotation = Attitude(pitch, roll, heading).rotation()
     true = replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + world.focal * rng.normal()))
     off = rng.normal(0, world.attitude_deg, 3)
-    told = told_attitude(world, pitch + off[0], roll + off[1], (heading + off[2]) % 360)
+    attitude = measured_attitude(world, pitch + off[0], roll + off[1], (heading + off[2]) % 360)
     depth, (place, turn, length) = rng.uniform(50, 90), world.survey
     bars = []
     for slot in rng.permutation(3)[: world.bars]:
-        sight = np.array([(slot - 1) * 0.055 + rng.uniform(-0.02, 0.02), rng.uniform(-0.025, 0.025), 1.0])
+        ray = np.array([(slot - 1) * 0.055 + rng.uniform(-0.02, 0.02), rng.uniform(-0.025, 0.025), 1.0])
         axis = np.array([*rng.normal(0, 0.02, 2), 1.0])
         arm = ALONG[:, None] * axis / np.linalg.norm(axis)
-        stands = rotation @ (sight * depth * rng.uniform(0.8, 1.0)) + arm
-        said = stands + rng.normal(0, place, 3) + np.cross(rng.normal(0, turn, 3), arm)
-        said = said + rng.normal(0, math.hypot(length, spec.stretch_share)) * arm
+        stands = rotation @ (ray * depth * rng.uniform(0.8, 1.0)) + arm
+        stated = stands + rng.normal(0, place, 3) + np.cross(rng.normal(0, turn, 3), arm)
+        stated = stated + rng.normal(0, math.hypot(length, spec.stretch_share)) * arm
         # What the place in a pixel makes of each point changes slowly.
-        bars.append((stands, said, rng.normal(0, PIXEL_PX, (16, 2))))
+        bars.append((stands, stated, rng.normal(0, PIXEL_PX, (16, 2))))
     fade = math.exp(-STEP_S / spec.slow_s)
     ahead = np.array([math.sin(math.radians(heading)), math.cos(math.radians(heading)), 0.0])
     state = np.concatenate([np.zeros(3), SPEED_M_S * ahead])
@@ -392,15 +392,15 @@ def drive(world: World, rng: np.random.Generator, spec: ErrorModel) -> tuple[lis
     root, sigma = np.linalg.cholesky(power), CameraSigma(focal_mm=world.focal * CAMERA.focal_mm)
     fixes, places = [], []
     for step in range(STEPS):
-        views, shaken = [], rng.normal(0, spec.shaken_sigma_px, 2)
-        for number, (stands, said, slow) in enumerate(bars):
+        views, vibration_px = [], rng.normal(0, spec.shaken_sigma_px, 2)
+        for number, (stands, stated, slow) in enumerate(bars):
             slow[:] = fade * slow + math.sqrt(1 - fade**2) * rng.normal(0, PIXEL_PX, (16, 2))
             points, _ = project_bars(stands, state[:3], rotation, true)
             shift = own_shift(points, spec) @ rng.normal(size=2)
-            off_px = (slow + rng.normal(0, NOISE_PX, points.shape)) @ uneven(points)
-            points, sigma_px = points + off_px + shift + shaken, np.full(16, POINT_PX)
-            views.append(BarView(number, said, points, sigma_px, world.survey, PIXEL_PX, across=ACROSS))
-        found = solve_pose(views, CAMERA, told, spec, sigma)
+            off_px = (slow + rng.normal(0, NOISE_PX, points.shape)) @ across_scale(points)
+            points, sigma_px = points + off_px + shift + vibration_px, np.full(16, POINT_PX)
+            views.append(BarView(number, stated, points, sigma_px, world.survey, PIXEL_PX, across=ACROSS))
+        found = solve_pose(views, CAMERA, attitude, spec, sigma)
         if isinstance(found, Pose):
             fixes.append(
                 replace(
@@ -462,12 +462,12 @@ def speeds(fixes: int) -> None:
 
 
 REFOCUSED = "focal length .5 % off"
-ATTITUDES: dict[str, Off] = {"attitude 1 degree off": turned, "attitude 10 ms late": late}
+ATTITUDES: dict[str, Off] = {"attitude 1 degree off": turn_one_angle, "attitude 10 ms late": delay_attitude}
 FAULTS: dict[str, Fault] = {
-    "bar .5 m off": moved,
-    "sites swapped": swapped,
-    REFOCUSED: refocused,
-    **{what: askew(by) for what, by in ATTITUDES.items()},
+    "bar .5 m off": move_bar,
+    "sites swapped": swap_sites,
+    REFOCUSED: change_focal_length,
+    **{what: turn_attitude(by) for what, by in ATTITUDES.items()},
 }
 
 
@@ -498,7 +498,7 @@ def main() -> None:
     rows += [(name, world, None) for name, world in stated_worlds().items()]
     for what, fault in FAULTS.items():
         for name, world in WORLDS.items():
-            if (what == "sites swapped" and world.bars < 2) or ("attitude" in what and world.told == "none"):
+            if (fault is swap_sites and world.bars < 2) or (what in ATTITUDES and world.attitude == "none"):
                 continue
             rows.append((f"{name}; {what}", world, fault))
     head = (

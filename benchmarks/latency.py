@@ -50,7 +50,7 @@ def delays_of(events: Events, link: Link, slice_us: int) -> tuple[list[Delay], f
     found: list[Delay] = []
     arrived_s = began_s = clock_s = free_s = longest_s = total_s = 0.0
 
-    def heard(frame: Frame) -> None:
+    def record_delay(frame: Frame) -> None:
         computed_s = time.process_time() - clock_s
         packet = link.packet
         chips = packet.frame_chips if packet.has_pilot(frame.frame) else packet.info_chips
@@ -58,7 +58,7 @@ def delays_of(events: Events, link: Link, slice_us: int) -> tuple[list[Delay], f
         parts_s = arrived_s - last_s, began_s - arrived_s, computed_s
         found.append(Delay(frame.t_us, *(part_s * 1e3 for part_s in parts_s)))
 
-    receiver = Receiver(link, on_frame=heard)
+    receiver = Receiver(link, on_frame=record_delay)
     ends_us = np.arange(int(events.t_us[0]) + slice_us, int(events.t_us[-1]), slice_us)
     begin = 0
     for end_us, end in zip(ends_us.tolist(), np.searchsorted(events.t_us, ends_us).tolist(), strict=True):

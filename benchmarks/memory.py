@@ -158,13 +158,13 @@ def raw(path: Path, pieces: Recorded) -> Path:
     return writer.path
 
 
-def tiled(path: Path) -> Path:
+def tile_recording(path: Path) -> Path:
     """A recording again and again."""
     tile(read_events(NIGHT), path.with_suffix(".raw"), 40_000_000)
     return path.with_suffix(".raw")
 
 
-def leaps(path: Path) -> Path:
+def leaping_clock(path: Path) -> Path:
     """65 536 events in EVT2, TIME_HIGH a month later every 16th one."""
     rng = np.random.default_rng(0)
     high = np.arange(0, 4096) * (30 * 86_400 * 1_000_000 >> 6) & 0xFFFFFFF
@@ -207,7 +207,7 @@ def triggers(path: Path) -> Path:
 
 CASES: dict[str, Callable[[Path], Path]] = {
     "night-50m": lambda path: Path(shutil.copy(NIGHT, path.with_suffix(".raw"))),
-    "night-50m, tiled to 40 Mev": tiled,
+    "night-50m, tiled to 40 Mev": tile_recording,
     "eight bars": lambda path: raw(path, eight_bars()),
     "a bar as large as the sensor": lambda path: raw(path, a_wall()),
     "252 blobs of 4 px, 40 Mev/s": lambda path: raw(path, blobs(21, 12, 40e6, 300_000)),
@@ -216,7 +216,7 @@ CASES: dict[str, Callable[[Path], Path]] = {
     "noise, 1 Gev/s": lambda path: raw(path, noise(1e9, 30_000)),
     "all the sensor flickers, 100 Hz": lambda path: raw(path, flicker(10_000, 1.0, 100_000)),
     "all the sensor blinks in code": lambda path: raw(path, in_code(0.1, 60_000)),
-    "EVT2, leaps of months": leaps,
+    "EVT2, leaps of months": leaping_clock,
     "NPZ, 1e8 events in 1 us": one_time,
     "NPZ, 3e8 triggers": triggers,
 }
@@ -230,8 +230,8 @@ AGAIN: dict[str, tuple[str, tuple[str, ...], bool]] = {
 """Cases received in another way: with options, and without kernels compiled before."""
 
 
-def measured(code: str, *arguments: object, cache: Path | None = None) -> tuple[int, float, float, str]:
-    """Run Python; exit code, peak memory, MB, seconds, and what it said on stderr.
+def run_measured(code: str, *arguments: object, cache: Path | None = None) -> tuple[int, float, float, str]:
+    """Run Python; exit code, peak memory, MB, seconds, and its stderr.
 
     Args:
         code: What sets `code`, the exit code.
@@ -259,7 +259,7 @@ def main() -> None:
         if not args.cases or any(c in name for c in args.cases)
     }
     print("| case | MB | s | exit | dropped, left out |\n|---|---|---|---|---|")
-    print(f"| an interpreter with numba | {measured(ALONE)[1]:.0f} | | | |", flush=True)
+    print(f"| an interpreter with numba | {run_measured(ALONE)[1]:.0f} | | | |", flush=True)
     above, todo = False, [case for case, *_ in chosen.values()]
     with tempfile.TemporaryDirectory() as folder:
         files = args.keep or Path(folder)
@@ -270,7 +270,7 @@ def main() -> None:
             path = next(found, None) or CASES[case](stem)
             out, cache = Path(folder) / "out", Path(folder) / "cache" if cold else None
             arguments = ("receive", path, "-o", out, *options)
-            code, peak_mb, elapsed_s, said = measured(COMMAND, *arguments, cache=cache)
+            code, peak_mb, elapsed_s, errors = run_measured(COMMAND, *arguments, cache=cache)
             if cache is not None:
                 shutil.rmtree(cache)
             summary = out / "summary.json"
@@ -279,7 +279,7 @@ def main() -> None:
             lost |= {"frames": counts.get("frames", 0)}
             print(f"| {name} | {peak_mb:.0f} | {elapsed_s:.0f} | {code} | {lost} |", flush=True)
             if code not in (0, 4):
-                print(said)
+                print(errors)
             above |= peak_mb > args.most
             todo.pop(0)
             if not args.keep and case not in todo:

@@ -34,14 +34,14 @@ BINS = (*pairwise(EDGES), (0.0, 1.0))
 ROUNDS = 1000
 _SELDOM = 0.05
 
-Judged = dict[str, list[tuple[float, int]]]
+Qualities = dict[str, list[tuple[float, int]]]
 
 
-def judged(scene: Scene, seed: int) -> Judged:
+def frame_qualities(scene: Scene, seed: int) -> Qualities:
     """Quality of each frame of a simulated scene, and how many of its symbols are wrong, by decoding."""
     with simulate(scene, seed) as source:
         events, _ = source.read()
-    found: Judged = {}
+    found: Qualities = {}
     for decoding in DECODINGS:
         link = load_link(overrides=[f"decoding.id={decoding}"])
         receiver = Receiver(link)
@@ -52,9 +52,9 @@ def judged(scene: Scene, seed: int) -> Judged:
         matched, own = match(rows, source.truth), found.setdefault(decoding, [])
         for sent, pairs in zip(matched.bars, matched.pairs, strict=True):
             for row, number in pairs:
-                said = np.array(row.symbols)
-                counts = (said >= 0) & ~(sent.cut[number] & ~sent.hidden[number])
-                own.append((quality[id(row)], int((said != sent.symbols[number])[counts].sum())))
+                symbols = np.array(row.symbols)
+                counts = (symbols >= 0) & ~(sent.cut[number] & ~sent.hidden[number])
+                own.append((quality[id(row)], int((symbols != sent.symbols[number])[counts].sum())))
     return found
 
 
@@ -68,19 +68,19 @@ def rows(recordings: list[list[tuple[float, int]]]) -> Iterator[list[str]]:
         if not n.sum():
             yield ["0", "-", "-"]
             continue
-        doubt, wrong = np.array([[(1 - p[:, 0]).sum(), (p[:, 1] > 0).sum()] for p in kept]).T
+        expected_errors, wrong = np.array([[(1 - p[:, 0]).sum(), (p[:, 1] > 0).sum()] for p in kept]).T
         drawn = rng.integers(0, len(kept), (ROUNDS, len(kept)))
         share = wrong[drawn].sum(1) / np.maximum(n[drawn].sum(1), 1)
         least, most = np.quantile(share, [0.025, 0.975])
-        said, true = doubt.sum() / n.sum(), wrong.sum() / n.sum()
-        star = "*" if _is_off(int(wrong.sum()), int(n.sum()), said) else ""
-        yield [str(n.sum()), f"{said:.2g}", f"{true:.2g}{star} ({least:.2g} to {most:.2g})"]
+        expected, true = expected_errors.sum() / n.sum(), wrong.sum() / n.sum()
+        star = "*" if _is_off(int(wrong.sum()), int(n.sum()), expected) else ""
+        yield [str(n.sum()), f"{expected:.2g}", f"{true:.2g}{star} ({least:.2g} to {most:.2g})"]
 
 
-def _is_off(wrong: int, frames: int, said: float) -> bool:
-    """Whether so many wrong frames are neither within a factor of 2 of what is said, nor chance."""
-    few = binom.cdf(wrong, frames, said / 2) < _SELDOM
-    many = binom.sf(wrong - 1, frames, min(2 * said, 1.0)) < _SELDOM
+def _is_off(wrong: int, frames: int, expected: float) -> bool:
+    """Whether so many wrong frames are neither within a factor of 2 of what is expected, nor chance."""
+    few = binom.cdf(wrong, frames, expected / 2) < _SELDOM
+    many = binom.sf(wrong - 1, frames, min(2 * expected, 1.0)) < _SELDOM
     return bool(few or many)
 
 
@@ -93,7 +93,7 @@ def main() -> None:
     scenes = [case.value for case in plan_of(args.campaign).scenes]
     work = [(scene, seed) for scene in scenes for seed in range(1, args.seeds + 1)]
     with ProcessPoolExecutor(args.jobs) as pool:
-        found = list(pool.map(judged, *zip(*work, strict=True)))
+        found = list(pool.map(frame_qualities, *zip(*work, strict=True)))
     print("| quality |" + "".join(f" {decoding}: frames | by it | wrong |" for decoding in DECODINGS))
     print("|---|" + "---|---|---|" * len(DECODINGS))
     tables = zip(*(rows([part[decoding] for part in found]) for decoding in DECODINGS), strict=True)

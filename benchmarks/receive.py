@@ -51,7 +51,7 @@ for line in sys.stdin:
 """
 
 
-def started(*folders: Path) -> subprocess.Popen[str]:
+def start(*folders: Path) -> subprocess.Popen[str]:
     """A process of the version of the SDK that is found in some folders."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, folders)), "OMP_NUM_THREADS": "1"}
     command, pipe = [sys.executable, "-P", "-c", CHILD], subprocess.PIPE
@@ -67,7 +67,7 @@ def receive(child: subprocess.Popen[str], *scene: Any) -> tuple[float, int]:
     return spent_s, frames
 
 
-def merged(one: Events, other: Events) -> Events:
+def merge(one: Events, other: Events) -> Events:
     """The events of both, in order."""
     return in_order(*vars(Events.concat([one, other])).values())
 
@@ -102,9 +102,9 @@ def usual_recordings(folder: Path) -> list[Path]:
     night = Events.of(night.t_us - night.t_us[0], night.x, night.y, night.p)
     long_us = int(night.t_us[-1])
     made = {
-        "noise": merged(night, Events.concat(list(noise(1e7, long_us)))),
-        "steady-lamps": merged(night, lamps(long_us, steady=True)),
-        "random-lamps": merged(night, lamps(long_us, steady=False)),
+        "noise": merge(night, Events.concat(list(noise(1e7, long_us)))),
+        "steady-lamps": merge(night, lamps(long_us, steady=True)),
+        "random-lamps": merge(night, lamps(long_us, steady=False)),
         "four-bars": four_bars(),
     }
     for name, events in made.items():
@@ -122,12 +122,12 @@ def main() -> None:
     given = parser.parse_args()
     link = None if given.config is None else str(given.config.resolve())
     with tempfile.TemporaryDirectory() as name:
-        versions = [started(ROOT, ROOT / "plugins")]
+        versions = [start(ROOT, ROOT / "plugins")]
         if given.against:
             old, source = Path(name, "old"), f"evlcp-sdk @ git+file://{ROOT}@{given.against}"
             install = sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target"
             subprocess.run([*install, old, source], check=True)
-            versions.append(started(old))
+            versions.append(start(old))
         for path in given.recordings or usual_recordings(Path(name)):
             scene = str(path.resolve()), link
             runs = [(child, given.cores) for child in versions]

@@ -60,7 +60,7 @@ def targets_of(table: Mapping[str, Any], name: str, bar: int) -> Plain:
     }
 
 
-def missed(tally: Tally | None, ghosts: int, targets: Mapping[str, Any]) -> list[str]:
+def missed_targets(tally: Tally | None, ghosts: int, targets: Mapping[str, Any]) -> list[str]:
     """Names of the figures that do not reach what they are held against; a figure that is not there does not.
 
     Args:
@@ -72,19 +72,19 @@ def missed(tally: Tally | None, ghosts: int, targets: Mapping[str, Any]) -> list
     if tally is None:
         return found
 
-    def over(name: str, value: float, key: str) -> None:
+    def check_limit(name: str, value: float, key: str) -> None:
         if key in targets and not value <= targets[key]:
             found.append(name)
 
     if "found" in targets and tally.frames_found < targets["found"] * tally.frames_sent:
         found.append("frames")
-    over("BER", tally.ber, "ber")
+    check_limit("BER", tally.ber, "ber")
     if tally.hidden:
-        over("claimed", tally.claimed_share, "claimed")
-    over("RMSE", tally.rmse_m, "rmse_m")
-    over("worst", tally.worst_m, "worst_m")
+        check_limit("claimed", tally.claimed_share, "claimed")
+    check_limit("RMSE", tally.rmse_m, "rmse_m")
+    check_limit("worst", tally.worst_m, "worst_m")
     if tally.filtered:
-        over("filtered", tally.filtered_rmse_m, "rmse_m")
+        check_limit("filtered", tally.filtered_rmse_m, "rmse_m")
     low, high = targets["nees"]
     if tally.ranged and not low <= tally.nees <= high:
         found.append("NEES")
@@ -113,7 +113,7 @@ def speed(path: Path, folder: Path, link: Link, rounds: int) -> Plain:
     }
 
 
-def measured(path: Path, make: Make, table: Mapping[str, Any], tool: Path, rounds: int) -> Plain:
+def measure(path: Path, make: Make, table: Mapping[str, Any], tool: Path, rounds: int) -> Plain:
     """Everything about a recording and a link; `fault` is in it where it cannot be received."""
     truth: Truth = read_truth(truth_path(path))
     lit = [bar for bar in truth.bars if bar.sends_frames]
@@ -145,13 +145,13 @@ def measured(path: Path, make: Make, table: Mapping[str, Any], tool: Path, round
                 {
                     "statistics": bar,
                     "targets": targets,
-                    "missed": missed(bar.total(), ghosts if number == 0 else 0, targets),
+                    "missed": missed_targets(bar.total(), ghosts if number == 0 else 0, targets),
                 }
             )
         if not found.bars:
             targets = targets_of(table, name, 0)
             result["bars"].append(
-                {"statistics": None, "targets": targets, "missed": missed(None, ghosts, targets)}
+                {"statistics": None, "targets": targets, "missed": missed_targets(None, ghosts, targets)}
             )
         if rounds:
             result["speed"] = speed(path, out, make(profile), rounds)
@@ -165,12 +165,12 @@ def number(value: float, digits: int = 3) -> str:
     return "0" if value == 0 else f"{value:.{digits}f}"
 
 
-def beside(value: float, limit: float | None, digits: int = 3) -> str:
+def with_limit(value: float, limit: float | None, digits: int = 3) -> str:
     """A figure and the limit that it is held against."""
-    said = number(value, digits)
+    text = number(value, digits)
     if limit is None or math.isnan(value):
-        return said
-    return f"{said} {'<=' if value <= limit else '>'} {limit:g}"
+        return text
+    return f"{text} {'<=' if value <= limit else '>'} {limit:g}"
 
 
 HEAD = [
@@ -182,11 +182,11 @@ HEAD = [
 def cells_of(tally: Tally, targets: Mapping[str, Any]) -> list[str]:
     """What a table says of a bar from its wrong bits to the bias of its distances."""
     return [
-        beside(tally.ber, targets.get("ber"), 5),
+        with_limit(tally.ber, targets.get("ber"), 5),
         number(tally.erased_share),
-        beside(tally.claimed_share, targets.get("claimed") if tally.hidden else None),
+        with_limit(tally.claimed_share, targets.get("claimed") if tally.hidden else None),
         str(tally.ranged),
-        beside(tally.rmse_m, targets.get("rmse_m"), 4),
+        with_limit(tally.rmse_m, targets.get("rmse_m"), 4),
         number(tally.bias_m),
     ]
 
@@ -218,7 +218,7 @@ def lines_of(result: Plain, link: str) -> list[list[str]]:
                 result["recording"] if i == 0 else "  bar " + str(i),
                 frames,
                 *cells_of(tally, targets),
-                beside(tally.worst_m, targets.get("worst_m")),
+                with_limit(tally.worst_m, targets.get("worst_m")),
                 number(tally.filtered_rmse_m),
                 nees,
                 str(result["ghosts"]) if i == 0 else "",
@@ -268,8 +268,8 @@ SPEED_HEAD = ["link", "recording", "Mev", "x real time", "Mev/s"]
 
 def speed_line(name: str, link: str, found: Plain, real_time: float | None) -> list[str]:
     def least(value: float, limit: float | None, digits: int) -> str:
-        said = f"{value:.{digits}f}"
-        return said if limit is None else f"{said} {'>=' if value >= limit else '<'} {limit:g}"
+        text = f"{value:.{digits}f}"
+        return text if limit is None else f"{text} {'>=' if value >= limit else '<'} {limit:g}"
 
     return [
         link,
@@ -329,7 +329,7 @@ FIGURES = [
 """Of a tally, what JSON gets."""
 
 
-def plain(results: Mapping[str, Sequence[Plain]]) -> Plain:
+def to_json(results: Mapping[str, Sequence[Plain]]) -> Plain:
     """Everything as JSON values; null where nothing was measured."""
 
     def bar_of(bar: Plain) -> Plain:
@@ -369,9 +369,9 @@ def main() -> None:
             (p / "tools" / "score_road.py" for p in path.resolve().parents if (p / "tools").is_dir()), Path()
         )
         for name, make in links.items():
-            results[name].append(measured(path, make, table, tool, args.rounds))
+            results[name].append(measure(path, make, table, tool, args.rounds))
     if args.json:
-        print(json.dumps(plain(results), indent=2))
+        print(json.dumps(to_json(results), indent=2))
     elif args.markdown:
         print_markdown(results)
     else:

@@ -20,12 +20,12 @@ EXIT_CODES = {
 }
 """Exit code of each exception of the SDK."""
 
-_SPOKEN = {"complain": 0, "BadParameter": 2, "SpecError": 2}
+_REPORTERS = {"complain": 0, "BadParameter": 2, "SpecError": 2}
 """What else carries a message to the terminal, and its exit code; 0 where the line alone ends nothing."""
 
 
 @dataclass(frozen=True, order=True)
-class Said:
+class Report:
     """One message.
 
     Attributes:
@@ -43,7 +43,7 @@ class Said:
     module: str
 
 
-def messages() -> list[Said]:
+def messages() -> list[Report]:
     """All messages of the SDK, in the order of their modules."""
     found = []
     for room in ROOMS:
@@ -53,9 +53,9 @@ def messages() -> list[Said]:
     return list(dict.fromkeys(found))
 
 
-def as_markdown(found: list[Said]) -> str:
+def as_markdown(found: list[Report]) -> str:
     """A table a package."""
-    packages: dict[str, list[Said]] = {}
+    packages: dict[str, list[Report]] = {}
     for one in found:
         packages.setdefault(".".join(one.module.split(".")[:2]), []).append(one)
     parts = []
@@ -68,45 +68,45 @@ def as_markdown(found: list[Said]) -> str:
     return "\n".join(parts) + "\n"
 
 
-def _of_module(path: Path, module: str) -> Iterator[Said]:
+def _of_module(path: Path, module: str) -> Iterator[Report]:
     """The messages of a file."""
 
-    def within(node: ast.AST, doc: str) -> Iterator[Said]:
+    def walk(node: ast.AST, doc: str) -> Iterator[Report]:
         for child in ast.iter_child_nodes(node):
             inner = doc
             if isinstance(child, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef):
                 inner = ast.get_docstring(child) or doc
             if isinstance(child, ast.Call):
                 name = getattr(child.func, "id", getattr(child.func, "attr", ""))
-                if name in EXIT_CODES or name in _SPOKEN:
+                if name in EXIT_CODES or name in _REPORTERS:
                     text = ", ".join(filter(None, map(_text, child.args)))
                     if re.search(r"[a-z]{3}", text):
-                        code = EXIT_CODES.get(name, _SPOKEN.get(name, 0))
-                        yield Said(text, name, code, _cause(doc, name), module)
-            yield from within(child, inner)
+                        code = EXIT_CODES.get(name, _REPORTERS.get(name, 0))
+                        yield Report(text, name, code, _cause(doc, name), module)
+            yield from walk(child, inner)
 
-    yield from within(ast.parse(path.read_text(encoding="utf-8")), "")
+    yield from walk(ast.parse(path.read_text(encoding="utf-8")), "")
 
 
 def _text(node: ast.expr) -> str:
-    """What an expression says, variable parts in capitals; nothing without a word of its own."""
+    """Text of an expression, its variable parts in capitals; empty without a word of its own."""
     if isinstance(node, ast.Constant):
         return node.value if isinstance(node.value, str) else ""
     if isinstance(node, ast.JoinedStr):
         return "".join(
-            _named(part.value) if isinstance(part, ast.FormattedValue) else str(part.value)  # type: ignore[attr-defined]
+            _placeholder(part.value) if isinstance(part, ast.FormattedValue) else str(part.value)  # type: ignore[attr-defined]
             for part in node.values
         )
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
-        sides = [_text(side) or _named(side) for side in (node.left, node.right)]
+        sides = [_text(side) or _placeholder(side) for side in (node.left, node.right)]
         return "".join(sides) if _text(node.left) or _text(node.right) else ""
     if isinstance(node, ast.IfExp):
         return " / ".join(filter(None, (_text(node.body), _text(node.orelse))))
     return ""
 
 
-def _named(node: ast.expr) -> str:
-    """A variable part, by its name."""
+def _placeholder(node: ast.expr) -> str:
+    """Name of a variable part, in capitals."""
     while isinstance(node, ast.Call | ast.Attribute | ast.Subscript):
         if isinstance(node, ast.Attribute) and node.attr not in ("name", "value", "shape", "message"):
             return node.attr.strip("_").upper()
@@ -121,7 +121,7 @@ def _named(node: ast.expr) -> str:
 
 
 def _cause(doc: str, name: str) -> str:
-    """What a docstring says of when an exception is raised."""
+    """When an exception is raised, by a docstring."""
     section = doc.partition("\nRaises:\n")[2].partition("\n\n")[0]
     entry = re.search(rf"^ {{4}}(?:\w+, )*{name}[\w, ]*: (.*(?:\n {{8}}.*)*)", section, re.MULTILINE)
     return " ".join(entry[1].split()) if entry else ""

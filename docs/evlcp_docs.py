@@ -50,7 +50,7 @@ def on_site(text: str, path: Path) -> str:
         path: The file that it is from.
     """
 
-    def moved(link: re.Match[str]) -> str:
+    def move_link(link: re.Match[str]) -> str:
         name, mark, anchor = link[1].partition("#")
         target = (path.parent / name).resolve()
         page = _PAGE_OF.get(target)
@@ -60,7 +60,7 @@ def on_site(text: str, path: Path) -> str:
             return link[0]
         return f"](/{os.path.relpath(target, ROOT / 'docs')}{mark}{anchor})"
 
-    return re.sub(r"\]\((?!\w+:|#)([^)\s]+)\)", moved, text)
+    return re.sub(r"\]\((?!\w+:|#)([^)\s]+)\)", move_link, text)
 
 
 def with_reference(text: str) -> str:
@@ -109,7 +109,7 @@ def _parameters(role: str) -> str:
     for entry in registry.installed(role):
         if entry.distribution == "evlcp-sdk":
             cls = registry.load_class(role, entry.algorithm.id)
-            meanings = _described(cls)
+            meanings = _descriptions(cls)
             for f in dataclasses.fields(cls):
                 cells = f"`{entry.algorithm.id}`", f"`{f.name}`", json.dumps(f.default), meanings[f.name]
                 rows.append(f"| {' | '.join(cells)} |")
@@ -140,8 +140,8 @@ def _read(app: Sphinx, page: str, source: list[str]) -> None:
         source[0] = with_reference(on_site(path.read_text(encoding="utf-8"), path))
 
 
-def _described(thing: Any) -> dict[str, str]:
-    """What the fields of a specification mean, where they say it themselves."""
+def _descriptions(thing: Any) -> dict[str, str]:
+    """Descriptions of the fields of a specification."""
     if not (isinstance(thing, type) and dataclasses.is_dataclass(thing)):
         return {}
     try:
@@ -165,7 +165,7 @@ def _docstring(app: Sphinx, what: str, name: str, thing: Any, options: Any, line
             text += ["::", ""] if fenced else [""]
         else:
             text.append(f"    {line}" if fenced else line)
-    if (meanings := _described(thing)) and "Attributes:" not in lines:
+    if (meanings := _descriptions(thing)) and "Attributes:" not in lines:
         text += ["", "Attributes:", *(f"    {field}: {meaning}" for field, meaning in meanings.items()), ""]
     if what in ("attribute", "property", "data") and text and ":" in text[0]:
         text[0] = f": {text[0]}"  # Napoleon takes what stands before the first colon for a type
@@ -184,15 +184,15 @@ def _signature(
     app: Sphinx, what: str, name: str, thing: Any, options: Any, signature: str | None, returned: str | None
 ) -> tuple[str | None, str | None]:
     """Arrays by their type alone, as their shapes are in the text; of a specification names and defaults."""
-    if _described(thing):
+    if _descriptions(thing):
         parameters = inspect.signature(thing).parameters.values()
         plain = [p.replace(annotation=p.empty) for p in parameters]
         signature = str(inspect.Signature(plain)).replace("<factory>", "...")
 
-    def short(text: str | None) -> str | None:
+    def shorten(text: str | None) -> str | None:
         return text and _LIKE.sub("ArrayLike", _ARRAY.sub(r"NDArray[\1]", text))
 
-    return short(signature), short(returned)
+    return shorten(signature), shorten(returned)
 
 
 class NotebookParser(MystParser):
@@ -206,11 +206,11 @@ class NotebookParser(MystParser):
         for cell in json.loads(inputstring)["cells"]:
             text = "".join(cell["source"])
             parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
-            parts += filter(None, map(_shown, cell.get("outputs", ())))
+            parts += filter(None, map(_show_output, cell.get("outputs", ())))
         super().parse("\n\n".join(parts) + "\n", document)
 
 
-def _shown(output: dict[str, Any]) -> str:
+def _show_output(output: dict[str, Any]) -> str:
     """What a cell showed: a picture, a table, or text."""
     data = output.get("data", {})
     if "image/png" in data:

@@ -14,7 +14,7 @@ from nbclient import NotebookClient
 FOLDER = Path(__file__).resolve().parent / "notebooks"
 
 
-def executed(path: Path) -> nbformat.NotebookNode:
+def execute(path: Path) -> nbformat.NotebookNode:
     """A notebook with what its cells show now; times and numbers of runs are left out.
 
     Raises:
@@ -42,7 +42,7 @@ def executed(path: Path) -> nbformat.NotebookNode:
     return notebook
 
 
-def said(notebook: nbformat.NotebookNode) -> list[str]:
+def printed_texts(notebook: nbformat.NotebookNode) -> list[str]:
     """What the cells of a notebook print, cell by cell."""
     return [
         "".join(output.text for output in cell.outputs if output.output_type == "stream")
@@ -57,11 +57,11 @@ def main(names: list[str]) -> None:
     wanted = [name for name in names if name != "--check"]
     for name in wanted or sorted(path.stem for path in FOLDER.glob("*.ipynb")):
         path = FOLDER / f"{name}.ipynb"
-        now = executed(path)
+        now, before = execute(path), nbformat.read(path, as_version=4)
         if not check:
             nbformat.write(now, path)
             continue
-        for shown, printed in zip(said(nbformat.read(path, as_version=4)), said(now), strict=True):
+        for shown, printed in zip(printed_texts(before), printed_texts(now), strict=True):
             if shown != printed:
                 sys.exit(f"{path.name} shows:\n{shown}\nand prints:\n{printed}\n`make notebooks` keeps that")
 

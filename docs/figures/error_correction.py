@@ -32,7 +32,7 @@ AIR_S = 346 * 100e-6
 """A packet of the default profile on air."""
 
 
-def received(
+def transmit(
     coded: NDArray[np.uint8], error_rate: float, rng: np.random.Generator, soft: bool
 ) -> NDArray[np.float32]:
     """LLRs of coded bits behind a channel."""
@@ -43,20 +43,20 @@ def received(
     return (2 * (sign + sigma * rng.normal(size=len(coded))) / sigma**2).astype(np.float32)
 
 
-def sent(
+def draw_blocks(
     code: Any, error_rate: float, soft: bool, blocks: int, seed: int = 0
 ) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
     """Random messages and what is received of them."""
     rng = np.random.default_rng([seed, code.coded_bits])
     for _ in range(blocks):
         message = rng.integers(0, 2, code.message_bits).astype(np.uint8)
-        yield message, received(code.encode(message), error_rate, rng, soft)
+        yield message, transmit(code.encode(message), error_rate, rng, soft)
 
 
 def frame_errors(code: Any, error_rate: float, soft: bool, blocks: int, enough: int = 100) -> tuple[int, int]:
     """Messages lost, of how many; ends when enough are."""
     lost = done = 0
-    for message, llr in sent(code, error_rate, soft, blocks):
+    for message, llr in draw_blocks(code, error_rate, soft, blocks):
         found = code.decode(llr)
         lost += not (found.ok and (found.bits == message).all())
         done += 1
@@ -116,7 +116,7 @@ def variants(blocks: int) -> None:
 
 
 @cache
-def approximated_phi() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def tabulate_phi() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Logarithms of a mean LLR, and of phi (Chung et al. 2001) there, by numerical integration."""
     mean = np.geomspace(1e-5, 2000, 400)
     z = np.linspace(-12, 12, 4001)
@@ -128,7 +128,7 @@ def approximated_phi() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def by_approximation(code: Any, error_rate: float) -> Any:
     """The same code, its information bits chosen for the channel and what is shortened."""
-    log_mean, log_phi = approximated_phi()
+    log_mean, log_phi = tabulate_phi()
     n = len(code.information)
     mean = np.full(n, 1e6)
     mean[code.sent] = 2 * ndtri(error_rate) ** 2
@@ -178,7 +178,7 @@ def wrong_paths(code: Any, llr: NDArray[np.float32], message: NDArray[np.uint8])
     return len(tried)
 
 
-def undetected(blocks: int) -> None:
+def count_undetected(blocks: int) -> None:
     """Messages that were not sent: counted, and expected from the wrong codewords left to the CRC."""
     heading("n", "channel", "blocks", "lost", "taken wrongly", "wrong codewords a block", "expected a block")
     for n in (256, 960):
@@ -187,7 +187,7 @@ def undetected(blocks: int) -> None:
             lost = wrong = tried = 0
             some = 0
             noise = np.random.default_rng([1, n])
-            for i, (message, llr) in enumerate(sent(code, min(rate, 0.49), True, blocks)):
+            for i, (message, llr) in enumerate(draw_blocks(code, min(rate, 0.49), True, blocks)):
                 if rate == 0.5:
                     llr = (np.abs(llr) * noise.choice([-1, 1], n)).astype(np.float32)
                 found = code.decode(llr)
@@ -212,7 +212,7 @@ def giving_up(blocks: int) -> None:
     ):
         hasty, patient = Polar().compile(n), Polar(list_size=32).compile(n)
         cost = 0
-        for _, llr in sent(hasty, rate, soft, blocks):
+        for _, llr in draw_blocks(hasty, rate, soft, blocks):
             cost += not hasty.decode(llr).ok and patient.decode(llr).ok
         row(n, f"{'AWGN' if soft else 'BSC'} {rate}", blocks, share(cost, blocks))
 
@@ -225,7 +225,7 @@ def rates() -> None:
         for name, rate in (("AWGN 0.04", 0.04), ("AWGN 0.11", 0.11), ("random signs", 0.5)):
             noise = np.random.default_rng(0)
             total = []
-            for _, llr in sent(code, min(rate, 0.04) if rate == 0.5 else rate, True, 100):
+            for _, llr in draw_blocks(code, min(rate, 0.04) if rate == 0.5 else rate, True, 100):
                 if rate == 0.5:
                     llr = (np.abs(llr) * noise.choice([-1, 1], n)).astype(np.float32)
                 best = inf
@@ -288,7 +288,7 @@ def main() -> None:
     if "rates" in wanted:
         rates()
     if "undetected" in wanted:
-        undetected(given.noise)
+        count_undetected(given.noise)
 
 
 if __name__ == "__main__":

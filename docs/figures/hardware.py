@@ -338,11 +338,11 @@ def picture(found: list[Part]) -> str:
     heights = [60.0] * columns
 
     def text(
-        x: float, y: float, said: str, anchor: str = "start", size: int = 10, bold: bool = False
+        x: float, y: float, content: str, anchor: str = "start", size: int = 10, bold: bool = False
     ) -> None:
         weight = ' font-weight="bold"' if bold else ""
         place = f'x="{x:.0f}" y="{y:.0f}" font-size="{size}" text-anchor="{anchor}"{weight}'
-        out.append(f"<text {place}>{escape(said)}</text>")
+        out.append(f"<text {place}>{escape(content)}</text>")
 
     def pin(x: float, y: float, number: str, name: str, net: str | None, right: bool) -> None:
         sign = 1 if right else -1

@@ -164,8 +164,8 @@ def timing(r: Recording) -> Figure:
     template = edges_of_chips(book.preamble)[::2].astype(float)
     taps = np.arange(len(template)) * 20 + 10
     most = len(window) - taps[-1]
-    heard = np.stack([window[t : t + most] for t in taps])
-    score = template @ heard / (np.linalg.norm(template) * np.linalg.norm(heard, axis=0) + 1e-9)
+    windows = np.stack([window[t : t + most] for t in taps])
+    score = template @ windows / (np.linalg.norm(template) * np.linalg.norm(windows, axis=0) + 1e-9)
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3), width_ratios=(2, 1), sharey=True)
     at = edges[:most]
     left.plot(at / 1e3, score, color=INK, lw=0.7)
@@ -219,16 +219,16 @@ def symbols(r: Recording) -> Figure:
     left.set(xticks=range(len(values)), xlabel="value", ylabel="ON less OFF events")
     titled(left, f"What cluster {k} showed")
     score = book.codeword_edges @ values
-    said = r.frame.soft.symbols[k]
+    symbol = r.frame.soft.symbols[k]
     middle.bar(range(len(score)), score, color="#999999")
-    middle.bar([said], [score[said]], color="#c0272d")
+    middle.bar([symbol], [score[symbol]], color="#c0272d")
     middle.set(xlabel="symbol", ylabel="correlation")
-    titled(middle, f"Against all codewords: {said}")
+    titled(middle, f"Against all codewords: {symbol}")
     bits = r.frame.soft.llr[k]
     right.bar(range(len(bits)), bits, color=np.where(bits > 0, "#999999", "#333333"))
     right.axhline(0, color=INK, lw=0.6)
     right.set(xlabel="bit", ylabel="ln P(0) / P(1)")
-    titled(right, f"Its bits: {said:06b}")
+    titled(right, f"Its bits: {symbol:06b}")
     for axis in (left, middle, right):
         plain(axis)
     return figure

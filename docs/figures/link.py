@@ -39,17 +39,17 @@ text { font: 12.5px system-ui, sans-serif; fill: #444; text-anchor: middle }
 """
 
 
-def rectangle(x: float, y: float, width: float, height: float, look: str) -> str:
-    return f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" {look}/>'
+def rectangle(x: float, y: float, width: float, height: float, style: str) -> str:
+    return f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" {style}/>'
 
 
-def said(x: float, y: float, text: str, look: str = "") -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" {look}>{escape(text)}</text>'
+def draw_text(x: float, y: float, text: str, style: str = "") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" {style}>{escape(text)}</text>'
 
 
 def bubble(middle: float) -> str:
     path = f"M{middle - 50} {TOP + 60}h100v44h-42l-14 16v-16h-44z"
-    return f'<path class="bubble" d="{path}"/>' + said(middle, TOP + 87, TEXT, 'class="big"')
+    return f'<path class="bubble" d="{path}"/>' + draw_text(middle, TOP + 87, TEXT, 'class="big"')
 
 
 def strip(x: float, colours: Sequence[str], wide: float = 16) -> str:
@@ -64,7 +64,7 @@ def numbers(middle: float, symbols: NDArray[np.int64], colours: Sequence[str]) -
     """The symbol of each cluster beside its colour."""
     high = HIGH / len(symbols)
     return strip(middle - 24, colours, 8) + "".join(
-        said(middle + 4, TOP + (k + 0.75) * high, str(symbol), 'class="symbol"')
+        draw_text(middle + 4, TOP + (k + 0.75) * high, str(symbol), 'class="symbol"')
         for k, symbol in enumerate(symbols)
     )
 
@@ -74,10 +74,10 @@ def cells(middle: float, looks: Sequence[Sequence[str]], wide: float) -> str:
     high = HIGH / len(looks)
     left = middle - wide * len(looks[0]) / 2
     return "".join(
-        rectangle(left + wide * i, TOP + k * high, wide - 0.6, high - 1, f'class="{look}"')
+        rectangle(left + wide * i, TOP + k * high, wide - 0.6, high - 1, f'class="{style}"')
         for k, row in enumerate(looks)
-        for i, look in enumerate(row)
-        if look
+        for i, style in enumerate(row)
+        if style
     )
 
 
@@ -132,10 +132,10 @@ def drawing() -> str:
         ("the text", "and where", "the car is"),
     )
     for x, lines in zip(at, captions, strict=True):
-        parts.append(said(x, TOP + HIGH + 30, lines[0], 'class="big"'))
-        parts += [said(x, TOP + HIGH + 48 + 17 * i, line) for i, line in enumerate(lines[1:])]
-    parts.append(said((at[0] + at[3]) / 2, 18, "transmitter", 'class="side"'))
-    parts.append(said((at[4] + at[8]) / 2, 18, "receiver", 'class="side"'))
+        parts.append(draw_text(x, TOP + HIGH + 30, lines[0], 'class="big"'))
+        parts += [draw_text(x, TOP + HIGH + 48 + 17 * i, line) for i, line in enumerate(lines[1:])]
+    parts.append(draw_text((at[0] + at[3]) / 2, 18, "transmitter", 'class="side"'))
+    parts.append(draw_text((at[4] + at[8]) / 2, 18, "receiver", 'class="side"'))
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img">'
     title = f"<title>From text to text: “{TEXT}” by light</title><style>{STYLE}</style>"
     return "\n".join([head, title, *parts, "</svg>\n"])

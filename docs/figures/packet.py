@@ -40,21 +40,21 @@ text { font: 12px system-ui, sans-serif; fill: #444 } .big { font-weight: 600; f
 """
 
 
-def box(x: float, y: float, wide: float, high: float, look: str) -> str:
-    return f'<rect x="{x:.1f}" y="{y:.1f}" width="{wide:.1f}" height="{high:.1f}" class="{look}"/>'
+def box(x: float, y: float, wide: float, high: float, style: str) -> str:
+    return f'<rect x="{x:.1f}" y="{y:.1f}" width="{wide:.1f}" height="{high:.1f}" class="{style}"/>'
 
 
-def said(x: float, y: float, text: str, look: str = "", anchor: str = "start") -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" class="{look}" text-anchor="{anchor}">{escape(text)}</text>'
+def draw_text(x: float, y: float, text: str, style: str = "", anchor: str = "start") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" class="{style}" text-anchor="{anchor}">{escape(text)}</text>'
 
 
 def strip(y: float, chips: NDArray[np.uint8]) -> list[str]:
     """Chips of one cluster."""
     looks = [("dark", "lit")[chip] for chip in chips.tolist()]
-    return [box(LEFT + CHIP * i, y, CHIP - 0.8, HIGH - 1, look) for i, look in enumerate(looks)]
+    return [box(LEFT + CHIP * i, y, CHIP - 0.8, HIGH - 1, style) for i, style in enumerate(looks)]
 
 
-def seen(y: float, chips: NDArray[np.uint8]) -> list[str]:
+def draw_edges(y: float, chips: NDArray[np.uint8]) -> list[str]:
     """What a pixel sees of chips: brighter up, darker down."""
     parts = [f'<path class="line" d="M{LEFT} {y}h{CHIP * len(chips)}"/>']
     for i, edge in enumerate(edges_of_chips(chips).tolist(), 1):
@@ -76,10 +76,10 @@ def drawing() -> str:
         parts += strip(TOP + HIGH * k, row)
     bottom = TOP + HIGH * len(chips)
     parts += [
-        said(LEFT - 10, TOP + 9, "cluster 0", anchor="end"),
-        said(LEFT - 10, bottom - 2, f"cluster {len(chips) - 1}", anchor="end"),
-        said(LEFT - 10, bottom + 32, "a pixel of 0", anchor="end"),
-        *seen(bottom + 28, chips[0]),
+        draw_text(LEFT - 10, TOP + 9, "cluster 0", anchor="end"),
+        draw_text(LEFT - 10, bottom - 2, f"cluster {len(chips) - 1}", anchor="end"),
+        draw_text(LEFT - 10, bottom + 32, "a pixel of 0", anchor="end"),
+        *draw_edges(bottom + 28, chips[0]),
     ]
     starts = (0, form.preamble_chips, form.preamble_chips + form.pilot_chips, form.frame_start_chip(1), shown)
     names = (
@@ -92,16 +92,18 @@ def drawing() -> str:
         x = LEFT + CHIP * a
         parts += [
             f'<path class="line" d="M{x} {TOP - 30}V{bottom + 44}"/>',
-            said(x + 5, TOP - 18, name, "big"),
-            said(x + 5, TOP - 5, f"{b - a} chips, {what}"),
+            draw_text(x + 5, TOP - 18, name, "big"),
+            draw_text(x + 5, TOP - 5, f"{b - a} chips, {what}"),
         ]
     y = bottom + 76
-    parts.append(said(LEFT, y - 8, "One info segment in other codes, and the edges that a pixel sees", "big"))
+    parts.append(
+        draw_text(LEFT, y - 8, "One info segment in other codes, and the edges that a pixel sees", "big")
+    )
     for name, what, overrides in OTHERS:
         codewords = load_link(overrides=list(overrides)).codebook.codewords
         word = codewords[27 % len(codewords)]
-        parts += [said(LEFT - 10, y + 9, name, "big", "end"), *strip(y, word), *seen(y + 29, word)]
-        parts.append(said(LEFT + CHIP * len(word) + 12, y + 9, f"{what}, {len(word)} chips"))
+        parts += [draw_text(LEFT - 10, y + 9, name, "big", "end"), *strip(y, word), *draw_edges(y + 29, word)]
+        parts.append(draw_text(LEFT + CHIP * len(word) + 12, y + 9, f"{what}, {len(word)} chips"))
         y += 58
     width = LEFT + CHIP * shown + 20
     head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {y}" role="img">'

@@ -218,7 +218,7 @@ def draw_scenes(scenes: Sequence[tuple[str, Scene]], path: Path, window_us: int 
     figure.savefig(path, dpi=110)
 
 
-def shown_scenes() -> list[tuple[str, Scene]]:
+def scenes_to_show() -> list[tuple[str, Scene]]:
     """The third step of each condition, cut in the middle of what happens in it."""
     found: dict[str, list[tuple[str, Scene]]] = {}
     for case in plan_of(CAMPAIGN).scenes:
@@ -238,7 +238,7 @@ def main() -> None:
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "docs" / "images")
     args = parser.parse_args()
     if args.results is None:
-        draw_scenes(shown_scenes(), args.out / "road-scenes.png")
+        draw_scenes(scenes_to_show(), args.out / "road-scenes.png")
         return
     found = steps_of(args.results)
     draw_verdicts(found, args.out / "road.png")

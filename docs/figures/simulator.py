@@ -86,11 +86,11 @@ def draw_area(axis: Axes) -> None:
     for row_us, style in ((0.2, "-"), (0.25, "--")):
         found = [latency_with_readout_us(replace(SENSOR, t_row_us=row_us), 0.277, n) for n in sides]
         axis.plot(sides, found, style, color=ON, label=f"simulated, {row_us} us a row")
-        told = ", ".join(
+        counts = ", ".join(
             f"{n} px {f:.0f} ({f / m - 1:+.0%})"
             for (n, m), f in zip(MEASURED_AREA.items(), found, strict=True)
         )
-        print(f"area, {row_us} us a row: {told}")
+        print(f"area, {row_us} us a row: {counts}")
     axis.plot(sides, list(MEASURED_AREA.values()), "o", color=INK, ms=4, label="measured")
     axis.legend(frameon=False, fontsize=8)
     plain(axis, "latency of a lit square, 0.277 W/m2", "side, px", "us")
@@ -185,11 +185,11 @@ def compare() -> None:
     if not paths:
         print("no ../shared/recordings: comparison left out")
         return
-    told = read_truth(SHARED / "night-50m-30kmh.truth.json")
-    scene = scene_of_truth(told.to_table())
+    truth = read_truth(SHARED / "night-50m-30kmh.truth.json")
+    scene = scene_of_truth(truth.to_table())
     columns = []
     for events, truth_ in (
-        (read_events(SHARED / "night-50m-30kmh.raw"), told),
+        (read_events(SHARED / "night-50m-30kmh.raw"), truth),
         *(
             (Events.concat(Simulation(made).stream()), truth_of(made))
             for made in (
@@ -205,10 +205,10 @@ def compare() -> None:
         print(f"| {key} | " + " | ".join(f"{c[key]:.4g}" for c in columns) + " |")
     print("| | Mev/s | ON share | frames | wrong bits | RMSE m (95 %) |\n|---|---|---|---|---|---|")
     for path in paths:
-        told = read_truth(path.with_suffix(".truth.json"))
-        made = scene_of_truth(told.to_table())
+        truth = read_truth(path.with_suffix(".truth.json"))
+        made = scene_of_truth(truth.to_table())
         for name, events, truth_ in (
-            (path.stem, read_events(path), told),
+            (path.stem, read_events(path), truth),
             ("simulated", Events.concat(Simulation(made).stream()), truth_of(made)),
         ):
             score = receive([events], truth_)
@@ -229,8 +229,8 @@ def compare_road() -> None:
         return
     print("| recording | Mev/s | here | share of ON events | here |\n|---|---|---|---|---|")
     for path in paths:
-        told = read_truth(path.with_suffix(".truth.json"))
-        made = scene_of_truth(told.to_table())
+        truth = read_truth(path.with_suffix(".truth.json"))
+        made = scene_of_truth(truth.to_table())
         theirs, ours = read_events(path), Events.concat(Simulation(made).stream())
         rates = (f"{len(events) / made.duration_s / 1e6:.2f}" for events in (theirs, ours))
         shares = (f"{events.p.mean():.3f}" for events in (theirs, ours))

@@ -58,10 +58,10 @@ def test_flashes_are_read_in_noise_and_with_events_missing():
     deframer = FlashPosition().compile(link.codebook, link.packet)
     both = evlcp.Events.concat([events, noise])
     both = both[np.argsort(both.t_us, kind="stable")]
-    state, heard = deframer.step(deframer.init(), both, end_us)
-    heard += deframer.close(state)[1]
-    assert len(heard) == symbols.size
-    assert all(one.soft.symbols[0] == symbols[one.packet, one.frame, 0] for one in heard)
+    state, decoded = deframer.step(deframer.init(), both, end_us)
+    decoded += deframer.close(state)[1]
+    assert len(decoded) == symbols.size
+    assert all(one.soft.symbols[0] == symbols[one.packet, one.frame, 0] for one in decoded)
     assert deframer.counts(state) == {"preambles": 5, "frames_dark": 0}
 
 
@@ -90,8 +90,8 @@ def test_sigma_is_that_of_many_trials():
         pixels = np.repeat(column[:, :, None], shape[2], 2).astype(np.float32)
         found.append(measure(replace(view, presence=replace(view.presence, pixels=pixels))))
     error = np.std([r.distance_m for r in found])
-    told = np.sqrt(np.mean([r.sigma_m**2 for r in found]))
-    assert 0.85 < told / error < 1.25
+    sigma_m = np.sqrt(np.mean([r.sigma_m**2 for r in found]))
+    assert 0.85 < sigma_m / error < 1.25
 
 
 def test_a_cell_that_never_stops_has_one_vote():

@@ -38,18 +38,18 @@ class Majority(evlcp.Decoding):
             votes = _votes(sums, presence.grid_px)
             voters = (presence.probability > self.min_presence).astype(np.int64)
             count = np.tensordot(voters, votes, ([1, 2], [1, 2]))
-            heard = np.tensordot(voters, np.abs(votes), ([1, 2], [1, 2]))
-            known, told = count[:, : pilots.shape[1]], count[:, pilots.shape[1] :]
-            cast = int(heard[:, : pilots.shape[1]].sum())
-            wrong = (cast - int((known * pilots).sum())) / 2
+            cast = np.tensordot(voters, np.abs(votes), ([1, 2], [1, 2]))
+            pilot_sums, value_sums = count[:, : pilots.shape[1]], count[:, pilots.shape[1] :]
+            pilot_votes = int(cast[:, : pilots.shape[1]].sum())
+            wrong = (pilot_votes - int((pilot_sums * pilots).sum())) / 2
             # Laplace's rule of succession: few votes are not sure, however well they agree.
-            error = min((wrong + 1) / (cast + 2), 0.5)
-            fit = told @ words.T
+            error = min((wrong + 1) / (pilot_votes + 2), 0.5)
+            fit = value_sums @ words.T
             # ln P(votes | codeword), but for what is common to all: half the votes ahead times the log-odds.
             likelihood = fit[:, None] * (np.log((1 - error) / error) / 2)
             sides = (np.where(z, likelihood, -np.inf) for z in (zero, ~zero))
             llr = np.subtract(*(np.logaddexp.reduce(side, -1) for side in sides))
-            total = int(heard[:, pilots.shape[1] :].sum())
+            total = int(cast[:, pilots.shape[1] :].sum())
             quality = max(int(fit.max(1).sum()), 0) / total if total else 0.0
             return evlcp.SoftSymbols(fit.argmax(1), llr.astype(np.float32), quality)
 
@@ -57,7 +57,7 @@ class Majority(evlcp.Decoding):
 
 
 def _votes(sums: NDArray[np.int16], grid_px: int) -> NDArray[np.int64]:
-    """What each cell says of each value, -1, 0 or 1, int64 (values, rows, columns)."""
+    """Vote of each cell for each value, -1, 0 or 1, int64 (values, rows, columns)."""
     chips, height, width = sums.shape
     rows, columns = height // grid_px, width // grid_px
     cells = sums[:, : rows * grid_px, : columns * grid_px].reshape(chips, rows, grid_px, columns, grid_px)

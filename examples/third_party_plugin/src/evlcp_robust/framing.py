@@ -96,14 +96,14 @@ class _Flashes:
         self, state: _State, events: evlcp.Events, until_us: float
     ) -> tuple[_State, list[evlcp.DecodedFrame]]:
         state = self._flashes(state, events.t_us[events.p == 1], until_us)
-        heard: list[evlcp.DecodedFrame] = []
+        decoded: list[evlcp.DecodedFrame] = []
         # A flash is known a chip after it began.
         known_us = until_us - self.packet.chip_us
         while True:
             if state.packet is None:
-                state = self._begun(state)
+                state = self._begin_packet(state)
                 if state.packet is None:
-                    return state, heard
+                    return state, decoded
             now = state.packet
             if now.frame == self.packet.frames:
                 state = replace(state, packet=None, last=now)
@@ -113,7 +113,7 @@ class _Flashes:
             # Up to half a slot before a frame a flash is of its first slot.
             edge_us = end_us - _SLOT_CHIPS / 2 * self.packet.chip_us
             if edge_us > known_us:
-                return state, heard
+                return state, decoded
             soft = self._soft([flash for flash in state.flashes if flash[0] < edge_us], start_us)
             state = replace(
                 state,
@@ -123,7 +123,7 @@ class _Flashes:
             )
             if soft is not None:
                 chip_us = self.packet.chip_us
-                heard.append(evlcp.DecodedFrame(now.number, now.frame, now.t_us, start_us, chip_us, soft))
+                decoded.append(evlcp.DecodedFrame(now.number, now.frame, now.t_us, start_us, chip_us, soft))
 
     def close(self, state: _State) -> tuple[_State, list[evlcp.DecodedFrame]]:
         return self.step(state, evlcp.Events.empty(), math.inf)
@@ -145,21 +145,21 @@ class _Flashes:
             i = j
         return replace(state, pending_us=t[i:], blind_us=blind_us, flashes=tuple(found))
 
-    def _begun(self, state: _State) -> _State:
-        """With the packet that the first preamble among the flashes begins, if there is one."""
+    def _begin_packet(self, state: _State) -> _State:
+        """Begin a packet at the first preamble among the flashes, if there is one."""
         flashes, chip_us = state.flashes, self.packet.chip_us
         for k in range(len(flashes) - 2):
-            apart = np.diff([t for t, _ in flashes[k : k + 3]]) / chip_us
-            if (np.abs(apart - 2) < 0.5).all():
+            gap_chips = np.diff([t for t, _ in flashes[k : k + 3]]) / chip_us
+            if (np.abs(gap_chips - 2) < 0.5).all():
                 t_us, last = flashes[k][0], state.last
                 packet_us = self.packet.packet_chips * chip_us
                 number = 0 if last is None else last.number + max(1, round((t_us - last.t_us) / packet_us))
-                begun = _Packet(number, t_us)
-                return replace(state, flashes=flashes[k + 3 :], packet=begun, preambles=state.preambles + 1)
+                packet = _Packet(number, t_us)
+                return replace(state, flashes=flashes[k + 3 :], packet=packet, preambles=state.preambles + 1)
         return replace(state, flashes=flashes[-2:])
 
     def _soft(self, flashes: list[tuple[float, int]], start_us: float) -> evlcp.SoftSymbols | None:
-        """What a frame says; None without a flash."""
+        """Soft symbol of a frame; None without a flash."""
         if not flashes:
             return None
         slots = 2**self.bits

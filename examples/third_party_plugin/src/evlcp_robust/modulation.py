@@ -24,8 +24,8 @@ class ReturnToZero(evlcp.Modulation):
 
     def codewords(self) -> NDArray[np.uint8]:
         """uint8 (2 ** bits, 2 + 2 * bits)."""
-        said = np.arange(2**self.bits)[:, None] >> np.arange(self.bits - 1, -1, -1) & 1
-        words = np.zeros((len(said), 2 + 2 * self.bits), np.uint8)
+        bits = np.arange(2**self.bits)[:, None] >> np.arange(self.bits - 1, -1, -1) & 1
+        words = np.zeros((len(bits), 2 + 2 * self.bits), np.uint8)
         words[:, 0] = 1
-        words[:, 2::2] = said
+        words[:, 2::2] = bits
         return words
