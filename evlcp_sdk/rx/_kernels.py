@@ -399,7 +399,7 @@ def select_boxes(
 
 
 @njit
-def add_polarity(
+def add_polarities(
     events: Columns,
     starts_us: tuple[float, float],
     chip_us: float,
@@ -408,11 +408,11 @@ def add_polarity(
     offset: Array,
     sums: Array,
 ) -> None:
-    """Add events to polarity sums (chips, height, width), what is at `centre` (2, chips) held in the middle.
+    """Add events to polarity sums (chips, height, width), with the image held still at `centre` (2, chips).
 
-    `offset` (2, chips) takes how far right and down from it that is then, as pixels are whole. The starts, of
-    positive and of negative events, hold in a row of the sensor; in each one after it, events come later:
-    `row` are by how much, us, and which that is.
+    `offset` (2, chips) takes the rest, right and down, as images move by whole pixels. `starts_us`, of
+    positive and of negative events, hold in one row of the sensor; each row below is later: `row` is by how
+    much, us, and which row that is.
     """
     t_us, x, y, p = events
     start_on_us, start_off_us = starts_us
@@ -493,7 +493,7 @@ _NOWHERE = np.uint32((1 << 32) - 1)
 def count_rows(
     t_us: Array, y: Array, p: Array, start_us: Array, step_us: float, top: float, block: float, counts: Array
 ) -> None:
-    """Add events to counts (polarity, blocks of rows, steps), from `start_us` (2,) and edge `top` on."""
+    """Add events to counts (polarity, blocks of rows, steps), from `start_us` (2,) and the edge `top` on."""
     _, blocks, steps = counts.shape
     first = np.searchsorted(t_us, min(start_us[0], start_us[1]))
     last = np.searchsorted(t_us, max(start_us[0], start_us[1]) + steps * step_us)
@@ -505,8 +505,8 @@ def count_rows(
 
 
 @njit
-def _connected(selected: Array, done: Array, cells: Array, row: int, column: int) -> int:
-    """Cells that are selected and connected (8 neighbours) with one, which is the first; how many."""
+def _collect_connected(selected: Array, done: Array, cells: Array, row: int, column: int) -> int:
+    """Collect a selected cell and those connected with it (8 neighbours) in `cells`; return how many."""
     rows, columns = selected.shape
     done[row, column] = True
     cells[0, 0], cells[0, 1] = row, column
@@ -537,7 +537,7 @@ def areas(selected: Array, hits: Array, boxes: Array, total: Array) -> int:
         for c in range(columns):
             if not selected[r, c] or done[r, c]:
                 continue
-            many = _connected(selected, done, cells, r, c)
+            many = _collect_connected(selected, done, cells, r, c)
             left, right, bottom, total[n] = c, c, r, 0
             for i in range(many):
                 total[n] += hits[cells[i, 0], cells[i, 1]]
@@ -549,16 +549,16 @@ def areas(selected: Array, hits: Array, boxes: Array, total: Array) -> int:
 
 
 @njit
-def blobs(selected: Array, grid: int) -> tuple[Array, Array, Array]:
-    """Connected cells (8 neighbours) of each cluster, most first: mean column + row * 1j, cluster, number.
+def find_blobs(selected: Array, grid: int) -> tuple[Array, Array, Array]:
+    """Connected cells (8 neighbours) of each cluster, largest first: mean column + row * 1j, cluster, cells.
 
-    Means are those of pixels, `grid` to a cell's side. Of as many cells, in the order of clusters, rows and
+    Means are in pixels, `grid` to a cell's side. Blobs of one size stay in the order of clusters, rows and
     columns.
     """
     clusters, rows, columns = selected.shape
     room, lit = 0, np.empty((clusters, 2), np.int64)
     for k in range(clusters):
-        lit[k, 0], lit[k, 1] = rows_of(selected[k])
+        lit[k, 0], lit[k, 1] = find_rows(selected[k])
         for r in range(lit[k, 0], lit[k, 1]):
             for c in range(columns):
                 room += selected[k, r, c]
@@ -573,7 +573,7 @@ def blobs(selected: Array, grid: int) -> tuple[Array, Array, Array]:
             for c in range(columns):
                 if not selected[k, r, c] or done[r, c]:
                     continue
-                count = _connected(selected[k], done, found, r, c)
+                count = _collect_connected(selected[k], done, found, r, c)
                 down, right = 0, 0
                 for i in range(count):
                     down += found[i, 0]
@@ -597,7 +597,7 @@ def blobs(selected: Array, grid: int) -> tuple[Array, Array, Array]:
 
 
 @njit
-def best_similarity(
+def find_similarity(
     blobs: tuple[Array, Array, Array],
     proposers: int,
     layout: Array,
@@ -606,12 +606,12 @@ def best_similarity(
     least_spacing: float,
     scale: complex,
 ) -> tuple[float, complex, complex]:
-    """Score, scale and shift of the similarity that has most cells of all blobs in their place.
+    """Score, scale and shift of the similarity that puts most cells of all blobs into their places.
 
-    Of the blobs (where, of which cluster, how many cells) the first propose: each pair of different clusters,
-    or, if `scale` is not 0, each one with this scale. A place reaches half a spacing and `slack` around;
-    cells off it count less by the square; scales with neighbours nearer than `least_spacing` do not count. Of
-    two that score alike, the earlier is taken.
+    The first `proposers` of the blobs (place, cluster, cells) propose: each pair of different clusters, or,
+    if `scale` is not 0, each blob with that scale. A place reaches half a spacing and `slack` around; cells
+    off its middle count less by the square; scales that put neighbours nearer than `least_spacing` do not
+    count. Of equal scores the first is taken.
     """
     at, cluster, cells = blobs
     best, best_s, best_shift = 0.0, complex(0.0, 0.0), complex(0.0, 0.0)
@@ -638,7 +638,7 @@ def best_similarity(
 
 
 @njit
-def refined_similarity(
+def refine_similarity(
     blobs: tuple[Array, Array, Array],
     layout: Array,
     spacing: float,
@@ -647,11 +647,10 @@ def refined_similarity(
     s: complex,
     shift: complex,
 ) -> tuple[complex, complex]:
-    """Least squares over the blobs in reach, three times; a `scale` known before is worth as many cells
-    again.
+    """Fit a similarity by least squares to the blobs within reach, three times; return scale and shift.
 
-    The known scale counts as if every cluster of the layout had been seen with it, with as many cells as
-    those seen have on average.
+    A `scale` known before counts as if every cluster of the layout had been seen with it, with as many cells
+    as those seen have on average.
     """
     at, cluster, cells = blobs
     for _ in range(3):
@@ -691,20 +690,20 @@ def refined_similarity(
 
 
 @njit
-def _share(off: float, half: float, grid: float) -> float:
-    """Part of a cell, `off` from a footprint's middle, that the footprint covers."""
+def _covered_share(off: float, half: float, grid: float) -> float:
+    """Share of a cell, `off` from the middle of a footprint, that the footprint covers."""
     return max(min(off + grid / 2, half) - max(off - grid / 2, -half), 0.0) / grid
 
 
 @njit
-def _strip(unit: complex, along: float, across: float) -> tuple[float, float]:
-    """How far to the right and down a strip reaches, so long along a direction, so wide across it."""
+def _strip_extent(unit: complex, along: float, across: float) -> tuple[float, float]:
+    """How far right and down a strip of length `along` and width `across` reaches."""
     right, down = abs(unit.real), abs(unit.imag)
     return along * right + across * down + 1e-6, along * down + across * right + 1e-6
 
 
 @njit
-def core_profile(
+def measure_core_profile(
     probability: Array,
     seen: Array,
     places: Array,
@@ -714,15 +713,15 @@ def core_profile(
     edge: float,
     out: Array,
 ) -> int:
-    """Presence of clusters in their place, less that of others, by distance from their line: `out`, 0 to 1.
+    """Measure the presence of clusters, less that of others, by distance from their line: `out`, 0 to 1.
 
-    A cell, in bins of 1 px, belongs to the seen cluster between whose ends, half a spacing on both sides, its
-    middle lies; its two neighbours may show in it, too. Cells in rows with the line leave distances out
-    between them: straight lines lead over those, and up to the first it stays the same.
+    A cell, in bins of 1 px, belongs to the seen cluster whose half spacing to both sides holds its middle;
+    that cluster's two neighbours may show in it, too. Distances without cells, between rows along the line,
+    are interpolated linearly; those before the first have its value.
 
     Returns:
-        How many distances belong to the line: to where presence, beyond its peak, first falls below `edge` of
-        that.
+        Number of distances that belong to the line: those before presence, beyond its peak, first falls below
+        `edge` of the peak.
     """
     _, rows, columns = probability.shape
     hits, cells = np.zeros(out.size), np.zeros(out.size)
@@ -738,7 +737,7 @@ def core_profile(
         for j in range(every.size):
             every[j] += cells_of[j]
     half = spacing / 2 + grid
-    wide, high = _strip(unit, half, float(hits.size))
+    wide, high = _strip_extent(unit, half, float(hits.size))
     for k in range(places.size):
         if not seen[k]:
             continue
@@ -747,7 +746,7 @@ def core_profile(
             for c in range(max(int((x - wide) / grid), 0), min(int((x + wide) / grid) + 1, columns)):
                 off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
                 off *= unit.conjugate()
-                share = _share(off.real, spacing / 2, grid)
+                share = _covered_share(off.real, spacing / 2, grid)
                 if share > 0 and abs(off.imag) < hits.size:
                     i = int(abs(off.imag))
                     cells[i] += share * share
@@ -777,7 +776,7 @@ def core_profile(
 
 
 @njit
-def pilot_light(
+def measure_pilot_light(
     sums: Array,
     codes: Array,
     every: int,
@@ -787,13 +786,14 @@ def pilot_light(
     least: float,
     light: tuple[Array, Array],
 ) -> bool:
-    """How far the pixels in each cluster's place follow its pilot, -1 to 1, 0 without a place: `light` (K,).
+    """Measure how well pixels in each cluster's place follow its pilot: `light` (K,), -1 to 1, 0 without any.
 
-    Its second part (K,) says which do so at all, and `least` as far as the median of those `seen` (K,); it
-    returns whether all do.
+    The second array of `light` (K,) takes which do at all, and `least` as well as the median of those `seen`
+    (K,); it returns whether all do.
 
-    `codes` are edges, (K, n), `every` so many chips. A pixel's value is the sign of the sum of the chip
-    behind one, or 0; where edges are in the middle of pairs, else the opposite of that of the chip before.
+    `codes` are edges (K, n), one every `every` chips. A pixel's value is the sign of its sum in the chip
+    behind an edge, or 0; for edges in the middle of pairs it is else the opposite of the sign in the chip
+    before.
     """
     (clusters, _, columns), (out, lit) = prior.shape, light
     length = codes.shape[1]
@@ -811,7 +811,7 @@ def pilot_light(
         edges = 0
         for i in range(length):
             edges += abs(codes[k, i])
-        top, bottom = rows_of(prior[k])
+        top, bottom = find_rows(prior[k])
         if edges == 0 or top >= bottom:
             out[k] = 0.0
             continue
@@ -849,8 +849,8 @@ def pilot_light(
 
 
 @njit
-def rows_of(image: Array) -> tuple[int, int]:
-    """First row that is not 0 throughout, and the one after the last; (0, 0) without any."""
+def find_rows(image: Array) -> tuple[int, int]:
+    """First row that is not all 0, and the one after the last; (0, 0) without any."""
     top, bottom = 0, 0
     for r in range(len(image)):
         some, row = False, image[r]
@@ -863,7 +863,7 @@ def rows_of(image: Array) -> tuple[int, int]:
 
 
 @njit
-def spread_between(
+def count_answers_between(
     sums: Array,
     codes: Array,
     places: Array,
@@ -872,11 +872,11 @@ def spread_between(
     zones: tuple[float, float, float],
     out: Array,
 ) -> None:
-    """Count answers of the pixels on the way from a cluster to its neighbour to the neighbour's edges.
+    """Count how pixels on the way from a cluster to its neighbour answer the neighbour's edges.
 
-    Those that come while the cluster itself stays as it is. `codes` are chips. `out` (2, 2, 3): the first of
-    the pair stays on, or off; answers and edges; before the first share of the way, up to the second, beyond.
-    `zones` are how far beside the way pixels are asked, px, and these shares.
+    Only edges during which the cluster itself stays as it is count. `codes` are chips. `out` (2, 2, 3):
+    cluster on or off; answers and edges; before the first share of the way, up to the second, beyond. `zones`
+    are how far beside the way pixels count, px, and the two shares.
     """
     half, first, last = zones
     chips = codes.shape[1]
@@ -914,7 +914,7 @@ def spread_between(
 
 
 @njit
-def spread_across(
+def count_answers_across(
     sums: Array,
     codes: Array,
     every: int,
@@ -924,16 +924,16 @@ def spread_across(
     along: float,
     out: Array,
 ) -> None:
-    """Count answers of the pixels beside the middle of clusters to the edges that tell them apart.
+    """Count how pixels beside the middle of clusters answer the edges that tell clusters apart.
 
-    `codes` are chips, edges come behind the first and every so many; `way` is the direction of the line, of
-    size 1; `along`, how far from a middle pixels may lie on it; `out` (2, 2 n + 1): answers and edges by
-    column, n to either side.
+    `codes` are chips, with an edge behind the first and every `every` chips; `way` is the direction of the
+    line, of size 1; pixels within `along` of a middle count. `out` (2, 2 n + 1): answers and edges by column,
+    n to either side.
     """
     chips = codes.shape[1]
     _, height, width = sums.shape
     most = out.shape[1] // 2
-    wide, high = _strip(way, along, most + 1.0)
+    wide, high = _strip_extent(way, along, most + 1.0)
     edge = np.empty(chips, np.int64)
     for k in range(len(places)):
         if not seen[k]:
@@ -959,7 +959,7 @@ def spread_across(
 
 
 @njit
-def mask(
+def mask_presence(
     presence: tuple[Array, Array, Array],
     seen: Array,
     place: tuple[Array, complex, float, int],
@@ -967,26 +967,26 @@ def mask(
     edge: float,
     out: tuple[Array, Array, Array, Array],
 ) -> None:
-    """Probability, choice and pixels with a layout's place taken in, and its prior, into zeros.
+    """Copy presence where a layout's place is into zeros, `out`, with the prior of each cluster in each cell.
 
-    Of a line, whose width shows within `bins` px from its axis and is that at `edge` of its peak; of a
-    layout of squares where there are none. The place is the clusters', a direction, spacing and grid. A
-    cluster's prior in a cell is its share of it; its pixels are those within reach of its place.
+    A line's width shows within `bins` px from its axis, and ends at `edge` of its peak; without bins the
+    layout is of squares. `place` are the clusters' places, a direction, spacing and grid. A cluster's prior
+    in a cell is its share of it; its pixels are those within a spacing of its place.
     """
     (likely, selected, pixels), (prior, probability, chosen, near) = presence, out
     places, unit, spacing, grid = place
     across, wide = spacing, 0
     profile = np.empty(bins)
     if bins:
-        wide = core_profile(likely, seen, places, unit, spacing, grid, edge, profile)
+        wide = measure_core_profile(likely, seen, places, unit, spacing, grid, edge, profile)
         across = float(wide)
         if wide == 0:
             # A line that shows nowhere is still none of a panel, which is what no profile says.
             wide, profile[0] = 1, 0.0
     (clusters, rows, columns), (_, height, width) = prior.shape, pixels.shape
     half = spacing / 2 + grid
-    cells_right, cells_down = _strip(unit, half, float(wide) if bins else half)
-    right, down = _strip(unit, spacing, across)
+    cells_right, cells_down = _strip_extent(unit, half, float(wide) if bins else half)
+    right, down = _strip_extent(unit, spacing, across)
     for k in range(clusters):
         x, y = places[k].real, places[k].imag
         for r in range(max(int((y - cells_down) / grid), 0), min(int((y + cells_down) / grid) + 1, rows)):
@@ -994,9 +994,9 @@ def mask(
             for c in range(left, min(int((x + cells_right) / grid) + 1, columns)):
                 off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
                 off *= unit.conjugate()
-                share = _share(off.real, spacing / 2, grid)
+                share = _covered_share(off.real, spacing / 2, grid)
                 if not bins:
-                    share *= _share(off.imag, spacing / 2, grid)
+                    share *= _covered_share(off.imag, spacing / 2, grid)
                 else:
                     share *= profile[int(abs(off.imag))] if abs(off.imag) < wide else 0.0
                 if share > 0:
@@ -1024,8 +1024,8 @@ _INNER = 0.3
 
 
 @njit
-def light_along(
-    heard: Array,
+def measure_light(
+    pilot_sums: Array,
     code: Array,
     every: int,
     at: complex,
@@ -1034,15 +1034,18 @@ def light_along(
     reach: float,
     out: Array,
 ) -> bool:
-    """Light of a cluster at `at`, row by row, by columns if the way `unit` lies flatter: `out`.
+    """Measure the light of a cluster at `at` in each line of pixels across the direction `unit`: `out`.
 
-    In each line of pixels across the way it is the sum of events in step with every `every`-th edge of
-    `code`, within `reach` of the way; `out` is this over the middle's, to the power of `_SHARPER`. To both
-    sides of a moving image's middle the events that its motion makes between edges are of opposite signs, and
-    all edges are told by one sign in some codes: only sums over whole lines leave these out. Less than none
-    is none; False if the middle has none.
+    Lines are rows, or columns where `unit` lies flat. A line's light is the sum of the events within `reach`
+    of the way that are in step with every `every`-th edge of `code`; `out` is this over the middle's, to the
+    power of `_SHARPER`. Events that a moving image makes between edges are of opposite signs to both sides of
+    its middle, and some codes mark all edges by one sign: only sums over whole lines cancel these. Negative
+    sums count as 0.
+
+    Returns:
+        False if the middle has no light.
     """
-    _, height, width = heard.shape
+    _, height, width = pilot_sums.shape
     rows = abs(unit.imag) >= abs(unit.real)
     place, side = (at.imag, at.real) if rows else (at.real, at.imag)
     slope = unit.real / unit.imag if rows else unit.imag / unit.real
@@ -1055,12 +1058,12 @@ def light_along(
     # Whole rows of pixels, side by side, are summed in less time than what is asked of them.
     top, bottom = first, last
     if not rows:
-        beside = abs(slope) * far + reach + 0.5
-        top, bottom = max(int(side - beside), 0), min(int(side + beside), height - 1)
+        margin = abs(slope) * far + reach + 0.5
+        top, bottom = max(int(side - margin), 0), min(int(side + margin), height - 1)
     answers = np.zeros((max(bottom - top + 1, 0), width), np.int32)
     sums = answers.reshape(-1)
     for j in range(0, code.size, every):
-        sign, line = np.int32(code[j]), heard[1 + j, top : bottom + 1].reshape(-1)
+        sign, line = np.int32(code[j]), pilot_sums[1 + j, top : bottom + 1].reshape(-1)
         for u in range(sums.size):
             sums[u] = np.int32(sums[u] + np.int32(sign * line[u]))
     for i in range(first, last + 1):
@@ -1084,11 +1087,11 @@ def light_along(
 
 
 @njit
-def boundary_between(mine: Array, its: Array, start: float, end: float) -> float:
-    """Where two clusters meet, a share of the way between them; NaN: unseen.
+def find_boundary(mine: Array, its: Array, start: float, end: float) -> float:
+    """Where two clusters meet, as a share of the way between their centres' lines; NaN if unseen.
 
-    Their centres are in the lines `start` and `end`. Line by line, the two's light, as of `light_along`, says
-    how much of it is the first's.
+    In each line from `start` to `end`, the light of both (`measure_light`) gives the share that is the
+    first's.
     """
     # Centres within a pixel have no way between them that its lines could share out.
     if abs(end - start) < 1.0:
@@ -1119,8 +1122,8 @@ _TOP = 0.7
 
 
 @njit
-def middle_across(
-    heard: Array,
+def find_offset_across(
+    pilot_sums: Array,
     edges: Array,
     x: float,
     y: float,
@@ -1131,16 +1134,15 @@ def middle_across(
 ) -> float:
     """How far beside (x, y) the middle of a cluster's light is, across a line of direction `unit`, px.
 
-    It is the mean of the pixels' events in step with the cluster's own edges (n,), within `along` of the
-    place and within `across` of the middle itself: a window about any other place, such as one of whole
-    cells, holds more of one side's light. Edges that light and those that darken count alike, however many
-    of either a code has: events follow a moving image between them, so that the ones show it ahead of where
-    it was, the others behind. These are added to `profile`, by columns where the line stands upright, else
-    by rows.
+    It is the mean of the events in step with the cluster's own edges (n,), within `along` of the place and
+    within `across` of the middle itself: a window about any other place, such as that of whole cells, would
+    hold more of one side's light. Rising and falling edges weigh alike, however many of either a code has:
+    events follow a moving image between edges, so that rising ones show it ahead of where it was, and falling
+    ones behind. `profile` takes these events by columns where the line stands upright, else by rows.
     """
-    _, height, width = heard.shape
+    _, height, width = pilot_sums.shape
     off = 0.0
-    wide, high = _strip(unit, along, across + 1.0)
+    wide, high = _strip_extent(unit, along, across + 1.0)
     top, bottom = max(int(np.ceil(y - high)), 0), min(int(y + high), height - 1)
     left, right = max(int(np.ceil(x - wide)), 0), min(int(x + wide), width - 1)
     if top > bottom or left > right:
@@ -1152,7 +1154,7 @@ def middle_across(
         ups, downs = ups + int(edge > 0), downs + int(edge < 0)
     for j in range(edges.size):
         if edges[j] != 0:
-            weight, image = edges[j] / (ups if edges[j] > 0 else downs), heard[1 + j]
+            weight, image = edges[j] / (ups if edges[j] > 0 else downs), pilot_sums[1 + j]
             for v in range(top, bottom + 1):
                 into, line = light[v - top], image[v, left:]
                 for u in range(wide):
@@ -1183,11 +1185,11 @@ def middle_across(
 
 
 @njit
-def flank_px(profile: Array) -> float:
-    """Over how many pixels a line's image fades out to each side, by the events of columns; NaN: unseen.
+def flank_width_px(profile: Array) -> float:
+    """Over how many pixels a line's image fades out to each side, by the events of columns; NaN if unseen.
 
-    Of a flank that falls evenly over w pixels, the sum of r (1 - r), r the share of all events, is w / 6 in
-    the mean over where in a pixel it begins; two flanks have twice that. What lies above `_TOP` is not in it.
+    For a flank that falls evenly over w pixels, the sum of r (1 - r), r the share of all events, is w / 6 on
+    average over where in a pixel it begins; two flanks have twice that. What exceeds `_TOP` counts as full.
     """
     first = second = 0.0
     for value in profile:
@@ -1203,25 +1205,25 @@ def flank_px(profile: Array) -> float:
 
 
 @njit
-def seek_clusters(
+def find_clusters(
     pixels: Array,
     shown: Array,
     places: Array,
     reach: float,
-    heard: Array,
+    pilot_sums: Array,
     edges: Array,
     line: tuple[complex, float],
     found: tuple[Array, Array],
 ) -> tuple[int, float]:
-    """Mean places of the clusters' pixels about where they should be, `found` (K, 2), NaN where unseen.
+    """Find the mean places of the clusters' pixels about where they should be: `found` (K, 2), NaN if unseen.
 
-    `shown` (K,) says which clusters to seek about their `places`, half of `reach`, their spacing, and 1.5 px
-    around. `heard` are the polarity sums of a pilot, `edges` the codes' (K, n), the first that into chip 1.
-    Of a `line` (its direction in the image, how far across it light counts, px, 0 for none), the middles
-    across it are those of `middle_across`. The second part of `found` (K,) is 1, NaN where unseen.
+    `shown` (K,) selects the clusters, sought about their `places` within half of `reach`, their spacing, and
+    1.5 px. `pilot_sums` are the polarity sums of a pilot, `edges` those of the codes (K, n), the first into
+    chip 1. For a `line` (its direction in the image, and how far across it light counts, px, 0 for none), the
+    middles across it are those of `find_offset_across`. The second array of `found` (K,) is 1, NaN if unseen.
 
     Returns:
-        How many are seen; how wide a line's flanks are, px, see `flank_px`, NaN of no line.
+        How many are seen; the width of a line's flanks, px, see `flank_width_px`, NaN without a line.
     """
     clusters, height, width = pixels.shape
     (unit, across), (points, wider) = line, found
@@ -1244,35 +1246,35 @@ def seek_clusters(
             points[k, 0], points[k, 1] = sum_x / sum_w, sum_y / sum_w
             if across > 0:
                 x, y = points[k, 0], points[k, 1]
-                off = middle_across(heard, edges[k], x, y, unit, 0.5 * reach, across, profile)
+                off = find_offset_across(pilot_sums, edges[k], x, y, unit, 0.5 * reach, across, profile)
                 points[k, 0] -= off * unit.imag
                 points[k, 1] += off * unit.real
-    return seen, flank_px(profile)
+    return seen, flank_width_px(profile)
 
 
 @njit
-def meet_neighbours(
+def centre_between_boundaries(
     mean: Array,
     places: Array,
     neighbours: Array,
     way: tuple[complex, float],
     pilot: tuple[Array, Array, int],
     points: Array,
-    by_one: float,
+    one_sided: float,
     wider: Array,
 ) -> None:
-    """Move clusters along a way to midway between their boundaries with their neighbours: `points` (K, 2).
+    """Move clusters along an axis to midway between their boundaries with their neighbours: `points` (K, 2).
 
-    `mean` (K, 2) are the middles of their pixels, NaN where unseen, `places` where they should be, and
-    `neighbours` (K,) the cluster beside each in the `way` (direction, spacing in px), -1 for none. `wider`
-    (K,) becomes `by_one` where a cluster has a boundary on one side only. `pilot` is as of `seek_clusters`,
-    and every how many edges tell clusters apart.
+    `mean` (K, 2) are the middles of their pixels, NaN if unseen, `places` where they should be, and
+    `neighbours` (K,) the next cluster along the axis of `way` (direction, spacing in px), -1 for none.
+    `wider` (K,) becomes `one_sided` where a cluster has a boundary on one side only. `pilot` holds sums and
+    edges as for `find_clusters`, and the chips from one edge that tells clusters apart to the next.
     """
     clusters = len(mean)
     along, reach = way
-    heard, edges, every = pilot
+    pilot_sums, edges, every = pilot
     rows = abs(along.imag) >= abs(along.real)
-    lines = heard.shape[1] if rows else heard.shape[2]
+    lines = pilot_sums.shape[1] if rows else pilot_sums.shape[2]
     lights, lit = np.empty((clusters, lines)), np.empty(clusters, np.bool_)
     centres = np.empty(clusters, np.complex128)
     before, after = np.empty(clusters), np.empty(clusters)
@@ -1282,14 +1284,14 @@ def meet_neighbours(
             off = (complex(mean[k, 0], mean[k, 1]) - places[k]) * along.conjugate()
             centres[k] = places[k] + along * complex(0.0, off.imag)
             window = 0.5 * reach + 1.5
-            lit[k] = light_along(heard, edges[k], every, centres[k], along, reach, window, lights[k])
+            lit[k] = measure_light(pilot_sums, edges[k], every, centres[k], along, reach, window, lights[k])
     for k in range(clusters):
         other = neighbours[k]
         if other < 0 or not (lit[k] and lit[other]):
             continue
         a, b = centres[k], centres[other]
         start, end = (a.imag, b.imag) if rows else (a.real, b.real)
-        share = boundary_between(lights[k], lights[other], start, end)
+        share = find_boundary(lights[k], lights[other], start, end)
         if -0.5 < share < 1.5:
             after[k] = before[other] = ((a + share * (b - a)) * along.conjugate()).real
     gap, both = 0.0, 0
@@ -1306,21 +1308,21 @@ def meet_neighbours(
         if has_before and has_after:
             centre = (before[k] + after[k]) / 2
         else:
-            wider[k] = by_one
+            wider[k] = one_sided
         move = centre - (complex(mean[k, 0], mean[k, 1]) * along.conjugate()).real
         points[k, 0] += move * along.real
         points[k, 1] += move * along.imag
 
 
 @njit
-def settle_points(
+def move_to_sensor(
     points: Array, layout: Array, places: Array, corner: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """Move points (K, 2) from an image to the sensor, on which its `corner` is; without those that are NaN.
+    """Move points (K, 2) from an image to the sensor, on which the image's `corner` is; NaN ones stay NaN.
 
     Returns:
-        Squares, px2, that the similarity leaves that fits them best; how far right and down of their places
-        (K,) in the image they are on the sensor in the mean.
+        Sum of squared residuals of the best similarity, px2; mean offset, right and down, of the points on
+        the sensor from their places (K,) in the image.
     """
     n = 0
     image_mean, layout_mean = complex(0.0, 0.0), complex(0.0, 0.0)
@@ -1352,17 +1354,18 @@ def settle_points(
 
 
 @njit
-def still_lit(
+def find_lit_clusters(
     sums: Array, weight: Array, grid: int, pilot_chips: int, least: float, seen: Array, out: Array
 ) -> tuple[float, float, float]:
-    """Whether those `seen` (K,) have events in more info chips than `least` of the pilot's: `out` (K,).
+    """Find which of the clusters `seen` (K,) still have events in the info segment: `out` (K,).
 
-    Of a sum over pixels, by shares of the chips; `weight` (K, rows, columns) is that of cells.
+    They need more than `least` of the pilot's rate, by the share of chips with events, summed over pixels
+    with the cells' `weight` (K, rows, columns).
 
     Returns:
-        How many more of the info chips than of the pilot's have events in pixels where no cluster is, by the
-        share of the pilot's that have in pixels of clusters; and how many of all pixels have in a chip of
-        that half of the info with the fewest, and of the other, over those in a chip of the pilot.
+        By how much the rate of info events in pixels without a cluster exceeds that of the pilot, over the
+        pilot's rate in pixels of clusters; and the events a chip, over the pilot's, of the darker and of the
+        brighter half of the info segment.
     """
     chips, height, width = sums.shape
     clusters, rows, columns = weight.shape
@@ -1392,7 +1395,7 @@ def still_lit(
     empty, shown, heavy = np.ones((rows, columns), np.bool_), 0.0, 0.0
     for k in range(clusters):
         total = 0.0
-        top, bottom = rows_of(weight[k])
+        top, bottom = find_rows(weight[k])
         for r in range(top, bottom):
             for c in range(columns):
                 if weight[k, r, c] != 0:
@@ -1423,15 +1426,16 @@ def calibrate_llr(
     symbols: Array,
     scaled: Array,
 ) -> float:
-    """Scale LLRs (K, bits) so that their sizes' variance is twice the mean, give the symbols that are sure.
+    """Scale LLRs (K, bits) so that their sizes' variance is twice the mean; keep the symbols that are sure.
 
-    A cluster's variance is pooled with that of all sizes of the frame, and with an expected one, a share of
-    its mean squared; `expected` are what the first is worth, in sizes, what the second, and the share.
-    Clusters unseen, or with a symbol of -1, are given LLRs of 0 and a symbol of -1; so are those less sure
-    than the first of `sure`, but for their LLRs. Of those that are wrong, the second are in one frame.
+    A cluster's variance is pooled with that of all sizes of the frame and an expected one, a share of its
+    mean squared; `expected` is what the first and the second are worth, in sizes, and the share. Clusters
+    unseen, or with a symbol of -1, get LLRs of 0 and a symbol of -1; those whose probability is below the
+    first of `sure` get a symbol of -1 only. The second of `sure` is how many wrong symbols come together in a
+    frame.
 
     Returns:
-        Probability that all that are given are right; 0 if none is.
+        Probability that all symbols given are right; 0 if none is.
     """
     frame_worth, expected_worth, spread = expected
     least, together = sure
@@ -1474,14 +1478,14 @@ def calibrate_llr(
 
 
 @njit
-def newest_on_parabola(
-    past: Array, speed_weight: float, bend_weight: float, worth: float, outlier: float
+def fit_newest(
+    past: Array, speed_weight: float, curvature_weight: float, worth: float, outlier: float
 ) -> tuple[float, float, float]:
-    """Rate of the newest of measurements and its variance, and the newest one's variance, by all of them.
+    """Rate of change at the newest of measurements and its variance, and the variance of the newest, by all.
 
-    `past` (n, 3) holds times, values and variances. Values follow a parabola whose rate and bend weigh as
-    much before any is measured. The squares of what is left, in those that the variances expect, `worth` of
-    them expected, scale the variances; squares beyond `outlier` count as that, and the newest for itself.
+    `past` (n, 3) holds times, values and variances. Values follow a parabola whose rate and curvature have
+    priors of these weights. Squared residuals over the expected ones, with `worth` expected ones added, scale
+    the variances; residuals beyond `outlier` are clipped, and the newest, if it is one, counts by its own.
     """
     n = len(past)
     terms, normal, right = np.empty(3), np.empty((3, 3)), np.empty(3)
@@ -1504,7 +1508,7 @@ def newest_on_parabola(
             for b in range(3):
                 likely[a, b] = normal[a, b]
         likely[1, 1] += speed_weight
-        likely[2, 2] += bend_weight
+        likely[2, 2] += curvature_weight
         inverted(likely, _ROUNDING, inverse)
         free, counted = float(n), 0.0
         for a in range(3):
@@ -1523,13 +1527,13 @@ def newest_on_parabola(
 
 
 @njit
-def _about_parabola(
+def _solve_parabola(
     place: Array, weight: Array, off: Array, least: float, right: Array, inverse: Array
 ) -> tuple[int, float]:
-    """Weighted least squares of a parabola: right sides (k, 3) for what lies off, (k, n), and the inverse.
+    """Weighted least squares of a parabola: right sides (k, 3) for offsets (k, n), and the inverse.
 
-    `off` is weighted. Boundaries of less than `least` of the heaviest weight are passed over; returns how
-    many are not, 0 where they are too few or lie on one place, and that weight.
+    `off` is weighted. Boundaries of less than `least` of the heaviest weight are left out. Returns how many
+    are used, 0 where they are too few or lie on one place, and that least weight.
     """
     lightest, n = 0.0, 0
     for i in range(place.size):
@@ -1549,65 +1553,65 @@ def _about_parabola(
 
 
 @njit
-def bend_of(
-    place: Array, sums: Array, least: float, wave: float, wave_variance: float
+def estimate_curvature(
+    place: Array, sums: Array, least: float, bias: float, bias_variance: float
 ) -> tuple[float, float]:
-    """Bend of a parabola through boundaries, and its variance by their scatter about it; NaN of too few.
+    """Curvature of a parabola through boundaries, and its variance by their scatter about it; NaN of too few.
 
-    `place` (n,) are where they are, `sums` (3, n) the weights, what lies off and what a wave of 1 would be,
-    both weighted; those of less than `least` of the heaviest are passed over. The wave is `wave` with a
-    variance.
+    `place` (n,) are where they are; `sums` (3, n) their weights, and weighted, their offsets and those of a
+    pixel- phase bias of 1; boundaries of less than `least` of the heaviest are left out. The phase bias is
+    `bias`.
     """
     right, inverse = np.empty((2, 3)), np.empty((3, 3))
     weight = sums[0]
-    n, lightest = _about_parabola(place, weight, sums[1:], least, right, inverse)
+    n, lightest = _solve_parabola(place, weight, sums[1:], least, right, inverse)
     # The variance of a normal variable over an estimated sigma is finite from three degrees of freedom on.
     if n - 3 < 3:
         return np.nan, np.nan
-    path, by_wave = np.zeros(3), 0.0
+    path, by_bias = np.zeros(3), 0.0
     for b in range(3):
-        by_wave += inverse[0, b] * right[1, b]
+        by_bias += inverse[0, b] * right[1, b]
         for a in range(3):
-            path[a] += inverse[a, b] * (right[0, b] - wave * right[1, b])
+            path[a] += inverse[a, b] * (right[0, b] - bias * right[1, b])
     left = 0.0
     for i in range(place.size):
         if weight[i] > lightest:
-            off = (sums[1, i] - wave * sums[2, i]) / weight[i]
+            off = (sums[1, i] - bias * sums[2, i]) / weight[i]
             off -= path[0] * place[i] ** 2 + path[1] + path[2] * place[i]
             left += weight[i] * off * off
-    return path[0], inverse[0, 0] * left / (n - 3 - 2) + wave_variance * by_wave * by_wave
+    return path[0], inverse[0, 0] * left / (n - 3 - 2) + bias_variance * by_bias * by_bias
 
 
 @njit
-def wave_of(
+def add_phase_bias(
     place: Array, sums: Array, least: float, out: Array, known: tuple[Array, Array], off: Array
 ) -> tuple[float, float, float, float, float]:
-    """What a frame's boundaries say of a wave in them that no parabola makes: added to `out` (4,).
+    """Add a frame's evidence of a pixel-phase bias, beyond any parabola, to `out` (4,).
 
-    That is the sum of the squares of the wave, of its products with what lies off, of the squares of that,
-    and degrees of freedom, all of what is left when the parabola is taken out that fits best; weighted.
-    `place`, `sums` and `least` as of `bend_of`.
+    That is, of the residuals about the best parabola, weighted: the sum of squares of the bias' pattern, of
+    its products with the offsets, of squares of the offsets, and the degrees of freedom. `place`, `sums` and
+    `least` are as in `estimate_curvature`.
 
-    `off` (n,) takes what lies off, NaN of boundaries that are passed over; `known` are sums (3, n) of
-    these frames with those before, and what lay off in the one before, or none.
+    `off` (n,) takes the offsets, NaN where left out; `known` are sums (3, n) of this frame and those before,
+    and the offsets of the one before, or none.
 
     Returns:
-        Sum of the squares of what lies off, and of its mean and that of the wave over all frames; the median
-        of what it moved by since the frame before, NaN of none; and how many frames weigh as much as all.
+        Sums of squares of the offsets, of their means and of the mean patterns over all frames; the median
+        change of the offsets since the frame before, NaN of none; and how many frames weigh as much as all.
     """
     right, inverse = np.empty((2, 3)), np.empty((3, 3))
     weight, moved = sums[0], np.empty(place.size)
     # A literal 0 would make a median of its own.
     many: Any = np.int64(0)
-    n, lightest = _about_parabola(place, weight, sums[1:], least, right, inverse)
-    squares, of_means, of_waves, light, all_light = 0.0, 0.0, 0.0, 0.0, 0.0
+    n, lightest = _solve_parabola(place, weight, sums[1:], least, right, inverse)
+    squares, mean_squares, pattern_squares, light, all_light = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(place.size):
         off[i] = np.nan
         if weight[i] > lightest:
             off[i] = sums[1, i] / weight[i]
             squares += off[i] * off[i]
-            of_means += (known[0][1, i] / known[0][0, i]) ** 2
-            of_waves += (known[0][2, i] / known[0][0, i]) ** 2
+            mean_squares += (known[0][1, i] / known[0][0, i]) ** 2
+            pattern_squares += (known[0][2, i] / known[0][0, i]) ** 2
             light += weight[i]
             all_light += known[0][0, i]
             if known[1].size == place.size and known[1][i] == known[1][i]:
@@ -1625,27 +1629,27 @@ def wave_of(
                 out[2] -= right[0, a] * inverse[a, b] * right[0, b]
         out[3] += n - 3
     frames = all_light / max(light, 1e-300)
-    return squares, of_means, of_waves, median(moved, many) if many else np.nan, frames
+    return squares, mean_squares, pattern_squares, median(moved, many) if many else np.nan, frames
 
 
 @njit
-def mean_length(
+def estimate_foreshortening(
     sine: Array, likely: Array, seen: float, sigma: float, along: float, across: float
 ) -> tuple[float, float]:
-    """Mean and variance of a leaning bar's foreshortening, by what is likely of its sines and what was seen.
+    """Mean and variance of a tilted bar's foreshortening, by the prior of its sines and the one measured.
 
-    That is how long it looks, in what one parallel to the sensor does at the same depth: exact, of a pinhole.
-    A bar whose direction has the part -sine along the optical axis, and whose middle is seen at tangents
-    (along, across) of the axis, looks sqrt(1 - sine^2 (1 + across^2)) + along sine times as long: in the
-    middle of the image cos(lean), elsewhere by `along` times the lean more or less, which is of first order.
+    That is its length over that of a bar parallel to the sensor at the same depth: exact, for a pinhole. A
+    bar whose direction has the part -sine along the optical axis, and whose middle is seen at tangents
+    (along, across) of the axis, looks sqrt(1 - sine^2 (1 + across^2)) + along sine times as long: cos(tilt)
+    in the middle of the image, elsewhere about `along` times the tilt more or less, which is of first order.
 
     Args:
-        sine: Sines of leans, float64 (n,).
-        likely: How likely each is before, float64 (n,).
+        sine: Sines of tilts, float64 (n,).
+        likely: Prior of each, float64 (n,).
         seen: The sine that was measured, NaN for none.
         sigma: Its standard deviation.
-        along: Of the sight.
-        across: Of the sight.
+        along: Of the line of sight.
+        across: Of the line of sight.
     """
     chance = likely
     if not np.isnan(seen):
@@ -1654,7 +1658,7 @@ def mean_length(
             off = (sine[i] - seen) / sigma
             chance[i] = likely[i] * exp(-0.5 * min(off * off, 1400.0))
         if not chance.sum() > 0:
-            # A bend that no lean makes says nothing of one.
+            # A curvature that no tilt makes says nothing of one.
             chance = likely
     total, mean, square = 0.0, 0.0, 0.0
     for i in range(sine.size):
@@ -1668,12 +1672,12 @@ def mean_length(
 
 
 @njit
-def farthest_off(selected: Array, grid: int, on: complex, turn: complex) -> float:
-    """Farthest that the middle of a cell of any cluster lies off the line through `on` along `turn`, px."""
+def farthest_offset_px(selected: Array, grid: int, on: complex, turn: complex) -> float:
+    """Farthest distance of the middle of any selected cell from the line through `on` along `turn`, px."""
     clusters, _, columns = selected.shape
     most = 0.0
     for k in range(clusters):
-        top, bottom = rows_of(selected[k])
+        top, bottom = find_rows(selected[k])
         for r in range(top, bottom):
             for c in range(columns):
                 if selected[k, r, c]:
@@ -1683,7 +1687,7 @@ def farthest_off(selected: Array, grid: int, on: complex, turn: complex) -> floa
 
 
 @njit
-def cells_by_place(
+def assign_cells(
     at: Array,
     cluster: Array,
     cells: Array,
@@ -1692,14 +1696,14 @@ def cells_by_place(
     half: float,
     seen: Array,
 ) -> tuple[int, int, float, int]:
-    """Which clusters are `seen` in their place (K,): by more cells than others are in it.
+    """Find which clusters are `seen` in their place (K,): by more cells than others have there.
 
-    A blob's cells are in place within `reach` of their cluster's; others stand in the nearest place, if that
-    is within `half`.
+    A blob's cells are in place within `reach` of their cluster's place; others belong to the nearest place
+    within `half`.
 
     Returns:
-        How many places show cells, in how many their cluster is seen, the cells of these, and the cells that
-        are farther than `reach` from every place.
+        Places that show cells; those in which their cluster is seen; the cells of these; and the cells
+        farther than `reach` from every place.
     """
     in_place, out_of_place, left = np.zeros(places.size), np.zeros(places.size), 0
     for i in range(at.size):
@@ -1776,14 +1780,14 @@ def clear_cells(hits: Array, boxes: Array, cell_shift: int) -> int:
 
 
 @njit
-def slope_of_rows(
+def fit_row_slope(
     rows: Array, fit: Array, seen: Array, fewest: int, chance: float, least: float
 ) -> tuple[float, float]:
-    """Lag from row to row at which blocks of rows fit best, and its sigma, lags; NaN of too few.
+    """Slope of the best lag over rows, lags a row, and its sigma; NaN of too few blocks.
 
-    `rows` (blocks,) are their middles, `fit` (blocks, lags) how well each fits, `seen` its events. A block
-    beside the light, or hidden, has next to none of the events, or fits no better than by chance: less than a
-    quarter of the median, or than `chance` sigmas of its events. `least` is the least error of a place.
+    `rows` (blocks,) are the blocks' middles, `fit` (blocks, lags) how well each fits, `seen` its events. A
+    block beside the light, or hidden, has few events, or fits by chance: less than a quarter of the median,
+    or than `chance` sigmas of its events. `least` is the least error of a place.
     """
     blocks, lags = fit.shape
     top = np.empty(blocks)
@@ -1830,7 +1834,7 @@ def slope_of_rows(
 
 
 @njit
-def delay_of_rows(
+def fit_row_delay(
     counts: Array,
     chips: Array,
     chip_steps: int,
@@ -1838,9 +1842,9 @@ def delay_of_rows(
     rows: Array,
     limits: tuple[int, float, float],
 ) -> tuple[float, float]:
-    """Delay from row to row by both polarities together, and its sigma, us; NaN where neither says it.
+    """Delay from row to row by both polarities together, and its sigma, us; NaN where neither shows it.
 
-    `counts` are those of `count_rows`, in steps of `step_us`; `rows` and `limits` those of `slope_of_rows`.
+    `counts` are those of `count_rows`, in steps of `step_us`; `rows` and `limits` are as in `fit_row_slope`.
     """
     fewest, chance, least = limits
     _, blocks, steps = counts.shape
@@ -1858,7 +1862,7 @@ def delay_of_rows(
                 for c in range(chips.size):
                     at = lag + c * chip_steps
                     fit[b, lag] += sign * chips[c] * (running[at + chip_steps] - running[at])
-        slope, sigma = slope_of_rows(rows, fit, seen, fewest, chance, least)
+        slope, sigma = fit_row_slope(rows, fit, seen, fewest, chance, least)
         if np.isfinite(slope):
             total += slope * step_us / (sigma * step_us) ** 2
             weight += 1 / (sigma * step_us) ** 2

@@ -281,7 +281,7 @@ class FrameAligner:
             if layout.line:
                 # A line's width is that of its cells; the layout says nothing of it.
                 turn = own.scale / abs(own.scale) * layout.way
-                across_px = _kernels.farthest_off(selected, grid, own.shift, turn) + grid / 2
+                across_px = _kernels.farthest_offset_px(selected, grid, own.shift, turn) + grid / 2
                 way *= layout.way
             places = placement.places(layout)
             right_px = along_px * abs(way.real) + across_px * abs(way.imag)
@@ -327,5 +327,7 @@ def polarity_sums(
     chip_us, row_us = float(lock.chip_us), float(lock.row_us)
     for e in events:
         columns = e.t_us, e.x, e.y, e.p
-        _kernels.add_polarity(columns, (on_us, off_us), chip_us, (row_us, row_px), centre_px, offset_px, sums)
+        _kernels.add_polarities(
+            columns, (on_us, off_us), chip_us, (row_us, row_px), centre_px, offset_px, sums
+        )
     return sums, offset_px

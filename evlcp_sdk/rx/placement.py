@@ -137,7 +137,7 @@ def placements(
         before: In a frame shortly before: its scale still holds.
         min_share: Least share of the clusters in place that counts without a doubt.
     """
-    blobs: _Blobs = _kernels.blobs(presence.selected, presence.grid_px)
+    blobs: _Blobs = _kernels.find_blobs(presence.selected, presence.grid_px)
     clusters = len(layout.at_m)
     at, _, many = blobs
     if not len(at):
@@ -199,7 +199,7 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
     pixels = np.zeros(given[2].shape, given[2].dtype)
     bins = math.ceil(spacing_px + _WIDEST_PX) if layout.line else 0
     place, out = (places, unit, spacing_px, presence.grid_px), (prior, probability, selected, pixels)
-    _kernels.mask(given, placement.seen, place, bins, _EDGE, out)
+    _kernels.mask_presence(given, placement.seen, place, bins, _EDGE, out)
     return PresenceMap(probability, presence.grid_px, selected, pixels, prior)
 
 
@@ -225,7 +225,7 @@ def lit(
         return presence, placement
     light, seen = np.empty(len(edges)), np.empty(len(edges), np.bool_)
     place, least = (presence.prior, presence.grid_px, placement.seen), _LEAST_LIGHT
-    if not _kernels.pilot_light(sums, edges, every, *place, least, (light, seen)):
+    if not _kernels.measure_pilot_light(sums, edges, every, *place, least, (light, seen)):
         presence = without(presence, ~seen)
     return presence, changed(placement, seen=seen)
 
@@ -254,9 +254,9 @@ def _voted(
         at_m = turned(layout, mirrored)
         scale = 0j if before is None else before.scale
         place, proposers = (at_m, layout.spacing_m, slack_px), min(len(blobs[0]), _PROPOSERS)
-        score, s, shift = _kernels.best_similarity(blobs, proposers, *place, _LEAST_SPACING_PX, scale)
+        score, s, shift = _kernels.find_similarity(blobs, proposers, *place, _LEAST_SPACING_PX, scale)
         if score > 0:
-            s, shift = _kernels.refined_similarity(blobs, *place, scale, s, shift)
+            s, shift = _kernels.refine_similarity(blobs, *place, scale, s, shift)
         if score > best_score * (_MIRRORED if mirrored else 1):
             best_score, best = score, (s, shift, mirrored)
     if best is None:
@@ -279,7 +279,7 @@ def _judged(
     places = scale * turned(layout, mirrored) + shift
     spacing_px, reach = abs(scale) * layout.spacing_m, _reach(scale, layout, slack_px)
     seen = np.empty(clusters, np.bool_)
-    shown, many, cells, left = _kernels.cells_by_place(*blobs, places, reach, spacing_px / 2, seen)
+    shown, many, cells, left = _kernels.assign_cells(*blobs, places, reach, spacing_px / 2, seen)
     # Where clusters are small, a cell stands in the place of two.
     odds = min(1.0, (2 * reach / spacing_px) ** (1 if layout.line else 2) / clusters)
     # As many similarities could have been proposed as there are choices of the clusters that fix one.

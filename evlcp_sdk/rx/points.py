@@ -75,7 +75,7 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
         across_px = max(_ACROSS_PX, reach_px / 2) if layout.line else 0.0
         mean, wider = np.empty((clusters, 2)), np.empty(clusters)
         line = unit * layout.way, across_px
-        seen, flank_px = _kernels.seek_clusters(
+        seen, flank_px = _kernels.find_clusters(
             presence.pixels, placement.seen, places, reach_px, heard, edges, line, (mean, wider)
         )
         x, y = placement.shift.real, placement.shift.imag
@@ -86,8 +86,10 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
         for axis, way in ways:
             to_next = unit * (way if at_m is layout.at_m else way.conjugate())
             along, pilot = (to_next, reach_px), (heard, edges, every)
-            _kernels.meet_neighbours(mean, places, neighbours[axis], along, pilot, points, _OUTER, wider)
-        squares, right_px, down_px = _kernels.settle_points(points, at_m, places, corner_px)
+            _kernels.centre_between_boundaries(
+                mean, places, neighbours[axis], along, pilot, points, _OUTER, wider
+            )
+        squares, right_px, down_px = _kernels.move_to_sensor(points, at_m, places, corner_px)
         freedom = max(2 * seen - 4, 0)
         variance = (_EXPECTED_WORTH * _SIGMA_PX**2 + squares) / (_EXPECTED_WORTH + freedom)
         return points, variance**0.5 * wider, flank_px, (x + right_px, y + down_px)

@@ -65,7 +65,7 @@ class Ranges(NamedTuple):
             the pixels' wave would make of them, both weighted, float64 (3, n); empty without any.
         bend_s: When that was, s.
         told: The attitude gave how the bar leans then.
-        wave: Sums that say how high the pixels' wave is, of `_kernels.wave_of`, float64 (4,).
+        wave: Sums that say how high the pixels' wave is, of `_kernels.add_phase_bias`, float64 (4,).
         image: How straight the bar's image is.
         off: How far boundaries lie off, as in `Bend`, beyond the lean that is known, in the newest frame, NaN
             where unseen, float64 (n,).
@@ -130,7 +130,7 @@ class RangeKeeper:
             goes_on = bend.shape == new.shape and told == (sight.sine is not None)
             bend, bend_s, told = new + faded * bend if goes_on else new, t_s, sight.sine is not None
             wave, off, known = wave * faded, np.empty(new.shape[1]), (bend, state.off)
-            scatter = _kernels.wave_of(measured.bend.place, new, _LEAST_WEIGHT, wave, known, off)
+            scatter = _kernels.add_phase_bias(measured.bend.place, new, _LEAST_WEIGHT, wave, known, off)
             sums = wave.tolist()
             height = _height(sums)
             distance_m -= _WAVE_SHARE * height[0] * measured.bend.wave_m
@@ -147,7 +147,7 @@ class RangeKeeper:
         past[:-1], past[-1] = old, (t_s, distance_m, sigma_m**2)
         # They follow a parabola whose speed and acceleration are likely as above; the squares of what is
         # left, in those that the sigmas expect, scale the variances.
-        speed_m_s, speed_variance, variance = _kernels.newest_on_parabola(
+        speed_m_s, speed_variance, variance = _kernels.fit_newest(
             past, _SPEED_M_S**-2, _ACCELERATION_M_S2**-2, _SCATTER_WORTH, _OUTLIER**2
         )
         distance_m -= speed_m_s * late_s
@@ -182,9 +182,9 @@ class RangeKeeper:
         off, sigma = math.nan, 1.0
         if newest is not None:
             # What puts the boundaries of every frame off alike is in their scatter about a parabola, too.
-            off, variance = _kernels.bend_of(newest.place, sums, _LEAST_WEIGHT, *wave)
+            off, variance = _kernels.estimate_curvature(newest.place, sums, _LEAST_WEIGHT, *wave)
             sigma = 1.0 if math.isnan(off) else math.sqrt(max(variance, 1e-12))
-        return _kernels.mean_length(sine, likely, told + off, sigma, sight.along, sight.across)
+        return _kernels.estimate_foreshortening(sine, likely, told + off, sigma, sight.along, sight.across)
 
     def _mixture(self, sigma_deg: float, share: float) -> Floats:
         """Chances of the leans of the grid: as surely as said, but for a share of which nothing is known."""

@@ -270,7 +270,7 @@ class FrameReader:
         soft = self._steps.decode(presence, aligned.sums_and_next, before, self._behind[due.index])
         lit, images = np.empty_like(placement.seen), (sums, presence.probability, presence.grid_px)
         # Where a stream has a gap, or a pole passes, silence is not what a cluster says.
-        beside, dim, most = _kernels.still_lit(
+        beside, dim, most = _kernels.find_lit_clusters(
             *images, self._pilot_chips, self._least_lit, placement.seen, lit
         )
         given = calibrate_llr(soft, lit)

@@ -122,10 +122,10 @@ class Spread:
         spacing_px = abs(placement.scale) * layout.spacing_m
         if spacing_px > 0:
             places, seen = placement.places(layout), placement.seen
-            _kernels.spread_between(sums, pilots, places, seen, pairs, (_AXIS_PX, _FROM, _TO), between)
+            _kernels.count_answers_between(sums, pilots, places, seen, pairs, (_AXIS_PX, _FROM, _TO), between)
             if layout.line:
                 way = placement.scale / abs(placement.scale) * layout.way
-                _kernels.spread_across(sums, pilots, every, places, seen, way, spacing_px / 4, across)
+                _kernels.count_answers_across(sums, pilots, every, places, seen, way, spacing_px / 4, across)
         return cls(between, across, spacing_px)
 
     def __add__(self, other: "Spread") -> "Spread":

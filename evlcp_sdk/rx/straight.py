@@ -112,7 +112,7 @@ def judge_image(
         bend: Of the frame.
         off: How far its boundaries lie off beyond the lean that is known, float64 (n,), NaN where unseen.
         sums: Their weights over the frames of the last second, and what lies off, weighted, (2 or more, n).
-        scatter: Of these, as of `_kernels.wave_of`.
+        scatter: Of these, as of `_kernels.add_phase_bias`.
         before: The frame before.
         t_s: When it is, s.
     """

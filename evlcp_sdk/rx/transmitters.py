@@ -193,7 +193,7 @@ def measure_row_delay(
             _kernels.count_rows(e.t_us, e.y, e.p, start_us, step_us, top_px, height_px / blocks, counts)
     rows_px = (np.arange(blocks) + 0.5) * height_px / blocks
     limits = _FEWEST_BLOCKS, _CHANCE_SIGMAS, _PLACE_SIGMA_US / step_us
-    return _kernels.delay_of_rows(counts, chips, _STEPS, step_us, rows_px, limits)
+    return _kernels.fit_row_delay(counts, chips, _STEPS, step_us, rows_px, limits)
 
 
 def retime(lock: SyncLock, start_us: float, pieces: Iterable[tuple[int, Events]]) -> SyncLock:

@@ -98,14 +98,12 @@ def test_boundaries_are_where_lines_balance(seed):
     start, end, share = *rng.permutation([rng.uniform(0, 4), rng.uniform(7, 11)]), rng.uniform(0.2, 0.8)
     at, bright = start + share * (end - start), rng.uniform(0.5, 2, 12)
     mine = bright * np.clip((at - np.arange(12)) * np.sign(end - start) + 0.5, 0, 1)
-    assert _kernels.boundary_between(mine, bright - mine, start, end) == pytest.approx(share)
+    assert _kernels.find_boundary(mine, bright - mine, start, end) == pytest.approx(share)
     # Most of the lines are dark, or beyond the image; a reflection beside a bar brings two centres together.
     dark = np.where(abs(np.arange(12) - at) < 1, mine, 0)
-    assert np.isnan(_kernels.boundary_between(dark, dark, start, end))
-    assert np.isnan(_kernels.boundary_between(mine, bright - mine, 9.0, 20.0))
-    assert all(
-        np.isnan(_kernels.boundary_between(mine, mine, 4.0, 4.0 + apart)) for apart in (0.0, 0.5, -0.9)
-    )
+    assert np.isnan(_kernels.find_boundary(dark, dark, start, end))
+    assert np.isnan(_kernels.find_boundary(mine, bright - mine, 9.0, 20.0))
+    assert all(np.isnan(_kernels.find_boundary(mine, mine, 4.0, 4.0 + apart)) for apart in (0.0, 0.5, -0.9))
 
 
 @pytest.mark.parametrize("turn", [1j, 1.0, np.exp(1.2j), np.exp(0.5j)])
@@ -115,7 +113,7 @@ def test_the_middle_across_a_line_of_light_and_its_profile(turn):
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     light = 2000 * np.exp(-((((columns - 11.3 + 1j * (rows - 7.8)) * np.conj(turn)).imag / 1.5) ** 2) / 2)
     heard = np.concatenate([np.full((1, HEIGHT, WIDTH), 99), edges[:, None, None] * light]).astype(np.int16)
-    off = _kernels.middle_across(heard, edges, 11.0, 7.5, complex(turn), 5.0, 6.0, found)
+    off = _kernels.find_offset_across(heard, edges, 11.0, 7.5, complex(turn), 5.0, 6.0, found)
     assert off == pytest.approx((complex(0.3, 0.3) * np.conj(turn)).imag, abs=0.02)
     near = abs(((columns - 11.0 + 1j * (rows - 7.5)) * np.conj(turn)).real) <= 5
     # Steps up and steps down say it once each.
@@ -128,11 +126,11 @@ def test_flanks_are_as_wide_as_they_are():
     columns, widths = np.arange(20), (1.0, 2.0, 3.5)
     for width in widths:
         found = [
-            _kernels.flank_px(np.clip((5 - abs(columns - 9 - place)) / width + 0.5, 0, 1))
+            _kernels.flank_width_px(np.clip((5 - abs(columns - 9 - place)) / width + 0.5, 0, 1))
             for place in np.linspace(0, 1, 200, endpoint=False)
         ]
         assert np.mean(found) == pytest.approx(0.7 * width, rel=1e-3)
-    assert math.isnan(_kernels.flank_px(np.zeros(5)))
+    assert math.isnan(_kernels.flank_width_px(np.zeros(5)))
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 8, 63, 64])

@@ -80,7 +80,7 @@ def test_silence_is_not_what_a_cluster_says():
     probability = np.zeros((3, 3, 4), np.float32)
     probability[0, :, :2] = probability[1, :, 2:] = 0.9
     lit = np.empty(3, np.bool_)
-    _kernels.still_lit(sums, probability, 2, 16, 0.25, ALL[:3], lit)
+    _kernels.find_lit_clusters(sums, probability, 2, 16, 0.25, ALL[:3], lit)
     assert lit.tolist() == [True, False, False]
-    _kernels.still_lit(sums, probability, 2, 16, 0.25, ~ALL[:3], lit)
+    _kernels.find_lit_clusters(sums, probability, 2, 16, 0.25, ~ALL[:3], lit)
     assert not lit.any()

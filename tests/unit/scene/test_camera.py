@@ -154,7 +154,9 @@ def test_a_plumb_bar(pitch_deg, roll_deg, east, up, axis) -> None:
 
 def foreshortening(sine: float, along: float, across: float) -> float:
     """As the receiver has it: by one sine that is all that is likely."""
-    return float(_kernels.mean_length(np.array([sine]), np.ones(1), math.nan, 1.0, along, across)[0])
+    return float(
+        _kernels.estimate_foreshortening(np.array([sine]), np.ones(1), math.nan, 1.0, along, across)[0]
+    )
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.05, 0.0, -1.0), (-0.02, 0.0, 1.0)])
