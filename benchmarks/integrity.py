@@ -404,13 +404,13 @@ def drive(world: World, rng: np.random.Generator, spec: ErrorModel) -> tuple[lis
         if isinstance(found, Pose):
             fixes.append(
                 replace(
-                    Fix.refused(step * STEP_S * 1e6, found.transmitters, "", ""),
+                    Fix.from_refusal(step * STEP_S * 1e6, found.transmitters, "", ""),
                     enu_m=found.enu_m,
                     covariance_m2=found.covariance[:3, :3],
                     noise_m2=found.noise,
                     slow_m2=found.slow,
                     standing=found.standing,
-                    along=found.along,
+                    weakest_axis=found.along,
                     standing_slope=found.standing_slope,
                     heading_deg=Attitude.of_rotation(found.rotation).heading_deg or 0.0,
                 )

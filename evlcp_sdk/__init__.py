@@ -85,7 +85,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.simulated import SimulatedSource as SimulatedSource, simulate as simulate
     from evlcp_sdk.values import (
         Alternative as Alternative,
-        Bend as Bend,
+        Curvature as Curvature,
         DecodedFrame as DecodedFrame,
         Events as Events,
         FailedBar as FailedBar,
@@ -140,7 +140,7 @@ _HOMES = {
     "scene.sites": "BarSite load_sites",
     "simulated": "SimulatedSource simulate",
     "values": (
-        "Alternative Bend Events FailedBar Fix Frame FrameView DecodedFrame Packet PresenceMap Range "
+        "Alternative Curvature Events FailedBar Fix Frame FrameView DecodedFrame Packet PresenceMap Range "
         "ReceivedMessage Region SoftSymbols SyncLock Triggers"
     ),
 }

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk import _kernels
-from evlcp_sdk.values import Events, plain
+from evlcp_sdk.values import Events, to_kernel_array
 
 LEAP_US = 1_000_000
 """The longest pause that is believed at once: what was seen before a longer one is forgotten anyway."""
@@ -112,8 +112,8 @@ class CameraClock:
             return []
         if not (t_us.flags.carray and x.flags.carray and y.flags.carray and p.flags.carray):
             # Kernels take them as they are from here on.
-            t_us, x, y, p = plain(t_us), plain(x), plain(y), plain(p)
-            events = Events.as_is(t_us, x, y, p)
+            t_us, x, y, p = to_kernel_array(t_us), to_kernel_array(x), to_kernel_array(y), to_kernel_array(p)
+            events = Events.from_columns(t_us, x, y, p)
         if not self._starts_us:
             first_us = self._first(events)
             if first_us is None:
@@ -125,7 +125,7 @@ class CameraClock:
             if _kernels.all_ordered(t_us, x, y, *self._size, self._offset_us, inside_us):
                 self._state[0] = t_us[-1]
                 self.last_us = int(inside_us[-1])
-                return [Events.as_is(inside_us, x, y, p)]
+                return [Events.from_columns(inside_us, x, y, p)]
         return self._sorted(events)
 
     def close(self) -> list[Events]:

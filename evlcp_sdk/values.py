@@ -71,10 +71,10 @@ class Events:
         )
 
     @classmethod
-    def as_is(
+    def from_columns(
         cls, t_us: NDArray[np.int64], x: NDArray[np.uint16], y: NDArray[np.uint16], p: NDArray[np.uint8]
     ) -> "Events":
-        """Events from columns that are known to be of these types and of one length."""
+        """Events from columns whose types and lengths are right already: nothing is checked."""
         events = object.__new__(Events)
         vars(events).update(t_us=t_us, x=x, y=y, p=p)
         return events
@@ -88,11 +88,12 @@ class Events:
     def concat(cls, parts: Iterable["Events"]) -> "Events":
         """All events of `parts`, in order."""
         columns = [(q.t_us, q.x, q.y, q.p) for q in parts]
-        # Columns of one type and length stay so.
-        return Events.as_is(*map(np.concatenate, zip(*columns, strict=True))) if columns else cls.empty()
+        return (
+            Events.from_columns(*map(np.concatenate, zip(*columns, strict=True))) if columns else cls.empty()
+        )
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """The events as a table of pandas, with the columns t_us, x, y, p; copied.
+        """Copy the events to a pandas table with the columns t_us, x, y, p.
 
         Raises:
             ConfigError: pandas is not installed.
@@ -102,7 +103,7 @@ class Events:
         return frame
 
     def to_arrow(self) -> "pyarrow.Table":
-        """The events as a table of Arrow, with the columns t_us, x, y, p.
+        """The events as an Arrow table with the columns t_us, x, y, p.
 
         Raises:
             ConfigError: pyarrow is not installed.
@@ -110,7 +111,7 @@ class Events:
         return import_extra("pyarrow", "parquet").table({name: getattr(self, name) for name, _ in _COLUMNS})
 
     def __repr__(self) -> str:
-        return f"Events({_counted(self.t_us, 'event')})"
+        return f"Events({_format_count(self.t_us, 'event')})"
 
     def __len__(self) -> int:
         return len(self.t_us)
@@ -121,10 +122,9 @@ class Events:
             rows = np.asarray(rows)
             if rows.dtype != np.bool_ or rows.shape != self.t_us.shape:
                 return Events(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
-            # By their numbers, events are taken several times as fast as by a mask.
+            # Indices select events several times as fast as a mask.
             (rows,) = rows.nonzero()
-        # Columns of one type and length stay so.
-        return Events.as_is(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
+        return Events.from_columns(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,11 +167,11 @@ class Triggers:
         return Triggers(self.t_us[rows], self.channel[rows], self.value[rows])
 
     def __repr__(self) -> str:
-        return f"Triggers({_counted(self.t_us, 'edge')})"
+        return f"Triggers({_format_count(self.t_us, 'edge')})"
 
 
 def span_us(events: Events, triggers: Triggers) -> tuple[int, int]:
-    """First and last time of a piece of a stream, in which something is, camera clock, us."""
+    """First and last time of a piece of a stream that is not empty, camera clock, us."""
     columns = [column for column in (events.t_us, triggers.t_us) if len(column)]
     return min(int(column[0]) for column in columns), max(int(column[-1]) for column in columns)
 
@@ -202,16 +202,16 @@ class SyncLock:
     """Where a transmitter's packets stand on the camera's clock.
 
     Attributes:
-        packet_t_us: Start of a packet's first preamble chip, us, as the earliest events of rising edges show
-            it; other packets lie whole periods away.
+        packet_t_us: Start of a packet's first preamble chip, us, by the earliest ON events of its edges;
+            other packets lie whole periods away.
         chip_us: Length of a chip on the camera's clock, us.
-        delay_on_us: What to add to a chip's start so that the window of one chip holds the positive events
-            of an edge at that start best, us; negative where these events last nearly a chip.
+        delay_on_us: From a chip's start to that of the window, one chip long, that best holds the positive
+            events of an edge at that start, us; negative where these events last nearly a chip.
         delay_off_us: The same for negative events.
         quality: Normalised preamble correlation, 0 to 1.
-        row_us: How much later the events of a row of the bar come than those of the row above, us; the delays
-            hold in its centre. The receiver measures it, synchronization leaves it 0.
-        last_row_us: How much later than in its centre they come in its last row, us.
+        row_us: Delay of a row's events after those of the row above, us; the other delays hold in the bar's
+            centre. The receiver measures it, synchronization leaves it 0.
+        last_row_us: Delay of the bar's last row after its centre, us.
     """
 
     packet_t_us: float
@@ -234,7 +234,7 @@ class PresenceMap:
         pixels: Pilot correlation of the pixels in and around each cluster's selected cells, float32
             (K, height, width), 0 elsewhere; the maps that ranging needs.
         prior: The same probability by the bar's place alone, float32 (K, rows, columns); None where it is not
-            known. `probability` is 0 where this is, and has no more of it in.
+            known. `probability` is 0 where this is 0, and is otherwise independent of it.
     """
 
     probability: NDArray[np.float32]
@@ -243,18 +243,17 @@ class PresenceMap:
     pixels: NDArray[np.float32]
     prior: NDArray[np.float32] | None = None
 
-    def informed(self) -> "PresenceMap":
-        """With what the bar's place says taken into `probability` by Bayes' rule; as it is without a prior.
+    def apply_prior(self) -> "PresenceMap":
+        """Combine `probability` with the prior by Bayes' rule; the map itself where there is no prior.
 
-        What a cell shows tells how well it can be read, too; for a decoding that knows that by other means, a
-        dim cell in its place counts in full.
+        The probability alone also says how well a cell can be read; a decoding that knows that by other means
+        counts a dim cell in the right place in full.
         """
-        prior = self.prior
-        if prior is None:
+        if self.prior is None:
             return self
         probability = np.empty_like(self.probability)
-        _kernels.take_in(self.probability, prior, probability)
-        return changed(self, probability=probability)
+        _kernels.take_in(self.probability, self.prior, probability)
+        return replace_fields(self, probability=probability)
 
     def __repr__(self) -> str:
         clusters, rows, columns = self.selected.shape
@@ -265,15 +264,15 @@ class PresenceMap:
 
 @dataclass(frozen=True, eq=False)
 class SoftSymbols:
-    """What one frame carries, and how certain that is.
+    """The symbols of one frame, and how certain they are.
 
     Attributes:
-        symbols: Most likely symbol of each cluster, int64 (K,); -1 where it is not given: the cluster was not
-            seen, or the symbol is rather wrong than right.
+        symbols: Most likely symbol of each cluster, int64 (K,); -1 where none is given: the cluster was not
+            seen, or its symbol is more likely wrong than right.
         llr: Log-likelihood ratio ln P(bit 0) / P(bit 1) of each bit, most significant first, float32 (K, m);
             0 where a cluster was not seen.
-        quality: Probability that all symbols given are right, 0 to 1: of frames with quality q, about 1 - q
-            have a wrong bit. The receiver takes it from the LLRs, whatever a decoding gives here.
+        quality: Probability that all given symbols are right, 0 to 1: of frames with quality q, about 1 - q
+            have a wrong bit. The receiver computes it from the LLRs, whatever a decoding gives here.
     """
 
     symbols: NDArray[np.int64]
@@ -281,19 +280,19 @@ class SoftSymbols:
     quality: float
 
     def __repr__(self) -> str:
-        return f"SoftSymbols({_symbols(self)}, quality {self.quality:.2f})"
+        return f"SoftSymbols({_format_symbols(self)}, quality {self.quality:.2f})"
 
 
 @dataclass(frozen=True, eq=False)
 class FrameView:
-    """What a decoded frame shows: all that ranging may use.
+    """The image of a decoded frame: all that ranging may use.
 
     Attributes:
         sums: Polarity sums of pilot and info segment with the bar held still, int16 (chips, height, width).
-        offset_px: What is left of the bar's motion in each chip: (right, down) of its centre from the middle
-            of the image, float64 (2, chips), px, within half a pixel.
+        offset_px: The bar's remaining motion in each chip: (right, down) of its centre from the middle of the
+            image, float64 (2, chips), px, within half a pixel.
         presence: Where each cluster is.
-        soft: What each cluster says.
+        soft: The symbol of each cluster.
     """
 
     sums: NDArray[np.int16]
@@ -307,30 +306,29 @@ class FrameView:
 
 
 @dataclass(frozen=True, eq=False)
-class Bend:
-    """How far boundaries between clusters lie off an even scale: what the lean of a bar shows in.
+class Curvature:
+    """How far the boundaries between clusters lie off an even scale, which shows the tilt of a bar.
 
     Attributes:
-        place: Where the boundaries are on the bar, from its middle, in spacings of clusters, float64 (n,).
-        off: How far each lies off, along the bar, in what a lean of sine 1 moves the boundary at place 1,
-            which is spacing_px * spacing_m / distance_m pixels; a lean moves others by place^2. float64 (n,);
-            also of those of weight 0 that were left out as they are out of line, else 0 there.
-        weight: Inverse variances of these, up to a factor that all share; 0 where unseen, float64 (n,).
-        wave: How far each seems off, in the same, for every pixel by which a boundary a quarter of a pixel
-            beyond the middle of one seems off: the sine of its place on the pixels. None where the ranging
-            does not know. float64 (n,).
-        wave_m: How far the distance is off for it, m.
-        spacing_px: From one cluster to the next in the image, px; NaN where the ranging does not say.
-        one_px: What `off` is in, px.
+        place: Positions of the boundaries on the bar, from its middle, in spacings of clusters, float64 (n,).
+        offset: How far each lies off, along the bar, float64 (n,). The unit is the shift of the boundary at
+            place 1 by a tilt of sine 1, spacing_px * spacing_m / distance_m pixels; a tilt shifts others by
+            place^2. Of a boundary of weight 0: how far it was off when it was rejected, else 0.
+        weight: Inverse variances of these, up to a common factor; 0 where unseen, float64 (n,).
+        phase_bias: Their pixel-phase bias, in the same unit, float64 (n,): the sine of a boundary's position
+            on the pixels, for an amplitude of one pixel. None where the ranging does not know it.
+        phase_bias_m: What this bias does to the distance, m.
+        spacing_px: From one cluster to the next in the image, px; NaN where the ranging does not give it.
+        unit_px: The unit of `offset`, px.
     """
 
     place: NDArray[np.float64]
-    off: NDArray[np.float64]
+    offset: NDArray[np.float64]
     weight: NDArray[np.float64]
-    wave: NDArray[np.float64] | None = None
-    wave_m: float = 0.0
+    phase_bias: NDArray[np.float64] | None = None
+    phase_bias_m: float = 0.0
     spacing_px: float = math.nan
-    one_px: float = math.nan
+    unit_px: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -338,14 +336,14 @@ class Range:
     """A distance along the optical axis.
 
     Attributes:
-        distance_m: Depth, m; NaN when the maps do not allow one.
+        distance_m: Depth, m; NaN where the maps allow none.
         sigma_m: Its standard deviation, m.
-        pairs: Number of cluster pairs that entered.
-        late_chips: Of a ranging: chips from the middle of the pilot, which a frame's distance is for, to when
-            the distance holds.
-        bend: Of a ranging: what it says of the bar's lean; None for nothing.
-        standing_m: The part of `sigma_m` that stays over frames, as what bends the bar's image does, m.
-        bent_px: Of an image of a bar that is bent, or has boundaries out of line: how far each lies off a
+        pairs: Number of cluster pairs that were used.
+        late_chips: Of a ranging: chips from the middle of the pilot, the time of a frame's distance, to the
+            time for which this distance holds.
+        curvature: Of a ranging: the boundaries of the bar; None where it does not give them.
+        standing_m: The part of `sigma_m` that persists over frames, as of a distorted image, m.
+        distortion_px: Of a distorted image, or one with boundaries out of line: how far each lies off a
             straight bar, along it, px, float64 (K - 1,), NaN where unseen. None of others.
     """
 
@@ -353,12 +351,12 @@ class Range:
     sigma_m: float
     pairs: int
     late_chips: float = 0.0
-    bend: Bend | None = field(default=None, compare=False)
+    curvature: Curvature | None = field(default=None, compare=False)
     standing_m: float = 0.0
-    bent_px: NDArray[np.float64] | None = field(default=None, compare=False)
+    distortion_px: NDArray[np.float64] | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
-        return f"Range({_distance(self)}, {self.pairs} pairs)"
+        return f"Range({_format_distance(self)}, {self.pairs} pairs)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,9 +367,9 @@ class Frame:
         transmitter: Number of the transmitter in order of first lock, from 0.
         packet: Number of the packet since the transmitter's first, from 0.
         frame: Number of the frame in its packet, from 0.
-        t_us: Start of the frame's first chip on the camera's clock, us: of its pilot, if it has one.
+        t_us: Start of the frame's first chip (of its pilot, if it has one), camera clock, us.
         soft: Symbols and log-likelihood ratios.
-        range: Distance; its values are NaN when the maps do not allow one, or the frame has no pilot.
+        range: Distance; NaN where the maps allow none, or the frame has no pilot.
         filtered: Distance filtered over time; None without tracking.
         x_px: Column of the bar's centre in the middle of the pilot, or of the info segment without one, px.
         y_px: Row of the same, px.
@@ -379,8 +377,8 @@ class Frame:
             where a cluster is not seen; empty for a frame without a pilot.
         points_sigma_px: Their standard deviations, px, float64 (K,).
         points_t_us: That time, camera clock, us.
-        echo_of: Number of the transmitter that this is a reflection of; None for a frame of its own.
-        link: Name of the link that it was sent with, of a receiver of several; empty of a receiver of one.
+        echo_of: Number of the transmitter that this is a reflection of; None where it is none.
+        link: Name of the link that it was sent with; empty if the receiver has one link only.
         points_flank_px: Over how many pixels a line's image fades out to each side; the narrower, the less it
             shows where in a pixel the line is. NaN where it is not known.
     """
@@ -402,8 +400,10 @@ class Frame:
     points_flank_px: float = math.nan
 
     def __repr__(self) -> str:
-        place = f"{_who(self.transmitter, self.echo_of)}, packet {self.packet}, frame {self.frame}"
-        return f"Frame({place}, {self.t_us / 1e3:.1f} ms, {_symbols(self.soft)}, {_distance(self.range)})"
+        transmitter = _format_transmitter(self.transmitter, self.echo_of)
+        content = f"{_format_symbols(self.soft)}, {_format_distance(self.range)}"
+        time = f"{self.t_us / 1e3:.1f} ms"
+        return f"Frame({transmitter}, packet {self.packet}, frame {self.frame}, {time}, {content})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -416,7 +416,7 @@ class DecodedFrame:
         packet_t_us: Start of the packet's first preamble chip, us.
         t_us: Start of the frame's first chip, us.
         chip_us: Length of a chip, us.
-        soft: What it says.
+        soft: Its symbols.
     """
 
     packet: int
@@ -437,17 +437,16 @@ class ReceivedMessage:
 
     Attributes:
         transmitter: Number of the transmitter, as in `Packet`.
-        packet: Number of the packet that completed it, or that changed how far it may be believed.
+        packet: Number of the packet that completed it, or that changed its trust.
         t_us: Start of that packet's first preamble chip on the camera's clock, us.
         message: What was received.
         kind: What it is.
-        value: What it says: a `Beacon`, a text, bytes, or what a plugin's kind makes of its payload.
-        trust: How far it may be believed. Texts and data are not signed, so they are `unverified`.
-        reason: Why it is not `verified`; where it is, when it was signed, and how long before
-            it was received.
+        value: Its content: a `Beacon`, a text, bytes, or what a plugin's kind makes of its payload.
+        trust: Whether it is authentic. Texts and data are not signed, so they are `unverified`.
+        reason: Why it is not `verified`; where it is, when it was signed, and how long before its reception.
         age_s: Time from a verified beacon's signature, which has whole seconds, to its reception, s; of a
-            message `time` from what it says to the start of that packet, below 0 where clocks disagree. None
-            where that is not known.
+            message `time` from its content to the start of that packet, below 0 where clocks disagree. None
+            where it is not known.
         link: Name of the link, as in `Frame`.
     """
 
@@ -464,11 +463,11 @@ class ReceivedMessage:
 
     @property
     def beacon(self) -> Beacon | None:
-        """What a beacon says; None for other kinds."""
+        """The content of a beacon; None for other kinds."""
         return self.value if self.message.kind == Kind.BEACON else None
 
     def summary(self, most: int = 60) -> str:
-        """What it says, the first `most` characters at least, for people to read."""
+        """The content for people to read, with at least the first `most` characters of it."""
         if self.beacon is not None:
             latitude_deg, longitude_deg, height_m = self.beacon.place
             return f"beacon at {latitude_deg:.7f}, {longitude_deg:.7f} deg, {height_m:.2f} m"
@@ -480,8 +479,8 @@ class ReceivedMessage:
         return f"{self.kind.name} {value if len(value) <= most else f'{value[:most]}...'}"
 
     def __repr__(self) -> str:
-        who = f"{self.summary()} from {self.message.transmitter_id}, {self.trust}"
-        return f"ReceivedMessage({who}, {self.t_us / 1e3:.1f} ms)"
+        content = f"{self.summary()} from {self.message.transmitter_id}, {self.trust}"
+        return f"ReceivedMessage({content}, {self.t_us / 1e3:.1f} ms)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -495,9 +494,9 @@ class Packet:
         chip_us: Length of a chip on the camera's clock, us.
         frames: The decoded frames in order; a frame that was not received is missing here.
         sent: Number of frames that a packet has.
-        block: What its bits carry; None if that is not known.
+        block: The message block in its bits; None where it is not known.
         block_packets: Packets whose LLRs were added to decode the block; 0 without one.
-        messages: Those that are complete with this packet, or whose trust changed.
+        messages: Those that this packet completed, or whose trust it changed.
     """
 
     transmitter: int
@@ -512,7 +511,7 @@ class Packet:
 
     @property
     def echo_of(self) -> int | None:
-        """Number of the transmitter that its frames, all of them, are a reflection of; None if of none."""
+        """Number of the transmitter that all its frames are a reflection of; None where they are none."""
         return self.frames[-1].echo_of if self.frames else None
 
     @property
@@ -521,17 +520,18 @@ class Packet:
         return self.frames[0].link if self.frames else ""
 
     def __repr__(self) -> str:
-        found = f"{len(self.frames)} of {self.sent} frames"
+        frames = f"{len(self.frames)} of {self.sent} frames"
         number = len(self.messages)
         messages = f", {number} message{'s' * (number != 1)}" if number else ""
-        place = f"{_who(self.transmitter, self.echo_of)}, packet {self.packet}"
-        return f"Packet({place}, {self.t_us / 1e3:.1f} ms, {found}{messages})"
+        place = f"{_format_transmitter(self.transmitter, self.echo_of)}, packet {self.packet}"
+        return f"Packet({place}, {self.t_us / 1e3:.1f} ms, {frames}{messages})"
 
     def _repr_html_(self) -> str:
-        """The packet as a notebook shows it: a row per frame, and what its messages say."""
+        """The packet as a notebook shows it: a row per frame, and the messages."""
         rows = "".join(
-            f"<tr><td>{f.frame}</td><td>{f.t_us / 1e3:.2f}</td><td>{escape(_symbols(f.soft, most=1024))}</td>"
-            f"<td>{f.soft.quality:.2f}</td><td>{escape(_distance(f.range))}</td></tr>"
+            f"<tr><td>{f.frame}</td><td>{f.t_us / 1e3:.2f}</td>"
+            f"<td>{escape(_format_symbols(f.soft, most=1024))}</td>"
+            f"<td>{f.soft.quality:.2f}</td><td>{escape(_format_distance(f.range))}</td></tr>"
             for f in self.frames
         )
         head = "".join(f"<th>{name}</th>" for name in ("frame", "ms", "symbols", "quality", "distance"))
@@ -547,7 +547,7 @@ class Packet:
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """One of the poses that fit where a fix is refused, as more than one does.
+    """One of several poses that fit, where a fix is refused for that.
 
     Attributes:
         latitude_deg: WGS-84.
@@ -556,10 +556,10 @@ class Alternative:
         enu_m: The same place in the local axes, m, float64 (3,).
         covariance_m2: Of `enu_m`, if this is the right one, float64 (3, 3); NaN where an ellipse does not
             describe its error.
-        heading_deg: Where the optical axis points to, clockwise from north.
-        pitch_deg: How far it points above the horizon.
-        roll_deg: How far the camera's top leans to its right.
-        likelihood: How likely the image is from here, against the likeliest.
+        heading_deg: Direction of the optical axis, clockwise from north.
+        pitch_deg: Its angle above the horizon.
+        roll_deg: Tilt of the camera's top to its right.
+        likelihood: How likely the image is from here, relative to the likeliest pose.
     """
 
     latitude_deg: float
@@ -575,19 +575,19 @@ class Alternative:
 
 @dataclass(frozen=True, eq=False)
 class FailedBar:
-    """Where the bar that was left out of a fix stands by its image, as seen from that fix.
+    """The bar that was left out of a fix, and how far off its site it stands as seen from that fix.
 
     Attributes:
         transmitter: Its number.
         off_m: Where it stands relative to its site: east, north, up, m, float64 (3,).
-        covariance_m2: Of that, float64 (3, 3).
-        missed: Probability that a test misses an error of as much.
+        covariance_m2: Covariance of this, float64 (3, 3).
+        missed_probability: Probability that the test misses an error as large as this.
     """
 
     transmitter: int
     off_m: NDArray[np.float64]
     covariance_m2: NDArray[np.float64]
-    missed: float
+    missed_probability: float
 
     @property
     def bias_m(self) -> float:
@@ -597,8 +597,8 @@ class FailedBar:
     @property
     def sigma_m(self) -> float:
         """Standard deviation of that, m."""
-        way = self.off_m / max(self.bias_m, 1e-12)
-        return math.sqrt(max(float(way @ self.covariance_m2 @ way), 0.0))
+        direction = self.off_m / max(self.bias_m, 1e-12)
+        return math.sqrt(max(float(direction @ self.covariance_m2 @ direction), 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -614,37 +614,36 @@ class Fix:
         covariance_m2: Of `enu_m`, float64 (3, 3).
         noise_m2: The part of it that is new with every fix, float64 (3, 3).
         slow_m2: The part that changes as the image moves over the pixels, float64 (3, 3).
-        heading_deg: Where the optical axis points to, clockwise from north.
-        pitch_deg: How far it points above the horizon.
-        roll_deg: How far the camera's top leans to its right.
+        heading_deg: Direction of the optical axis, clockwise from north.
+        pitch_deg: Its angle above the horizon.
+        roll_deg: Tilt of the camera's top to its right.
         heading_sigma_deg: Standard deviation of the heading.
-        transmitters: Numbers of the bars that count; of those in view where the fix is refused.
+        transmitters: Numbers of the bars it is computed from; of those in view where the fix is refused.
         verified: The places of all of them come from verified beacons, or from the user's file under an id
             that a verified beacon sent.
-        refusal: Kind of refusal, empty for a fix that is given.
+        refusal: Kind of refusal; empty for a fix that is given.
         detail: The refusal in words.
-        standing: What is left of the covariance by its causes, as the position's moves by one sigma of each
-            error that stays, m, float64 (3, k): `camera`, `attitude`, `bar N` and `doubt`, as a `Pose` has
+        standing: The rest of the covariance by its causes, as the position's shifts by one sigma of each
+            standing error, m, float64 (3, k): `camera`, `attitude`, `bar N` and `doubt`, as a `Pose` has
             them.
-        misfit: Mean square of the misses in sigmas, over the degrees of freedom.
+        misfit: Mean square of the residuals in sigmas, over the degrees of freedom.
         freedom: Degrees of freedom; 0 where the fix is refused.
-        hpl_m: Horizontal protection level: beyond it the error is with the probability `position.risk`, even
+        hpl_m: Horizontal protection level: the error exceeds it with the probability `position.risk`, even
             where one part is wrong; infinite where the geometry does not protect.
         vpl_m: The vertical one.
         excluded: What was left out as the rest contradicts it: `bar N`, `heading`, `attitude`, `focal
             length`.
-        source: `bars`, or `gnss`: a fix of satellites, which is taken for the track.
-        contradicted: What the track stands on where it contradicts this fix, if bars and GNSS disagree.
+        source: `bars`, or `gnss`: a fix of satellites, which the track uses.
+        contradicted: What the track relies on where it contradicts this fix, if bars and GNSS disagree.
         attitude_sigma_deg: Standard deviation of a turn of the camera about the least certain axis; NaN where
             no attitude is given.
         alternatives: Of a fix refused as `two-solutions`, the poses that fit, the likeliest first.
-        suspects: Of a fix refused as `misfit`, the parts of which one, if it were left out, would explain it.
-        along: The direction in which the position is the least certain, a unit vector, float64 (3,); 0 where
-            that is not known.
-        standing_slope: How `standing`, but for `doubt`, changes with the position along it, a metre, float64
-            (3, k).
-        hidden_m: By how much one part that is wrong, and whose test just passed, moves it at the most: east,
-            north, up, m, float64 (3,); infinite where there is no protection level.
+        suspects: Of a fix refused as `misfit`, the parts that would each explain it if left out.
+        weakest_axis: The direction in which the position is least certain, a unit vector, float64 (3,); 0
+            where it is not known.
+        standing_slope: Change of `standing`, but for `doubt`, a metre along this axis, float64 (3, k).
+        undetected_m: Largest shift by one wrong part whose test just passed: east, north, up, m, float64
+            (3,); infinite where there is no protection level.
         failed: The bar that was left out; None where none was.
     """
 
@@ -675,18 +674,18 @@ class Fix:
     attitude_sigma_deg: float = math.nan
     alternatives: tuple[Alternative, ...] = ()
     suspects: tuple[str, ...] = ()
-    along: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    weakest_axis: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     standing_slope: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
-    hidden_m: NDArray[np.float64] = field(default_factory=lambda: np.full(3, math.inf))
+    undetected_m: NDArray[np.float64] = field(default_factory=lambda: np.full(3, math.inf))
     failed: FailedBar | None = None
 
     @property
     def alarms(self) -> tuple[str, ...]:
-        """What a user must know before this fix is used.
+        """What a user must know before using this fix.
 
         `excluded`: a part was left out; `contradicted`: bars and GNSS disagree; `unavailable`: there is no
-        protection level; and the refusals `misfit` and `site-contradicted`, by which parts contradict one
-        another.
+        protection level; and the refusals for parts that contradict one another, `misfit` and
+        `site-contradicted`.
         """
         if self.refusal:
             return (self.refusal,) if self.refusal in ("misfit", "site-contradicted") else ()
@@ -703,8 +702,8 @@ class Fix:
         return f"Fix({time}, {place}, ± {east_m:.2g} E {north_m:.2g} N {up_m:.2g} U m)"
 
     @classmethod
-    def refused(cls, t_us: float, transmitters: tuple[int, ...], refusal: str, detail: str) -> Self:
-        """A refused fix: a time without a position, and the reason."""
+    def from_refusal(cls, t_us: float, transmitters: tuple[int, ...], refusal: str, detail: str) -> Self:
+        """A fix without a position, and the reason."""
         place, spread = np.full(3, math.nan), np.full((3, 3), math.nan)
         geodetic = angles = (math.nan, math.nan, math.nan)
         return cls(
@@ -716,41 +715,39 @@ _V = TypeVar("_V")
 _S = TypeVar("_S", bound=np.generic)
 
 
-def changed(value: _V, **fields: Any) -> _V:
-    """As `dataclasses.replace`, in a fifth of the time; of classes that check nothing and keep no slots."""
-    other = object.__new__(type(value))
-    vars(other).update(vars(value), **fields)
-    return other
+def replace_fields(value: _V, **fields: Any) -> _V:
+    """As `dataclasses.replace`, five times as fast; for classes without checks and slots."""
+    copy = object.__new__(type(value))
+    vars(copy).update(vars(value), **fields)
+    return copy
 
 
-def plain(array: NDArray[_S]) -> NDArray[_S]:
-    """An array as kernels take it: writeable, its elements side by side; a copy where it is not.
+def to_kernel_array(array: NDArray[_S]) -> NDArray[_S]:
+    """An array as kernels take it, writeable and contiguous; a copy where it is not.
 
-    For each other kind Numba would compile a kernel once more, which takes seconds.
+    For every other layout Numba would compile a kernel anew, which takes seconds.
     """
     return array if array.flags.carray else array.copy()
 
 
-def _counted(t_us: NDArray[np.int64], what: str) -> str:
-    """How many there are, and from when to when."""
+def _format_count(t_us: NDArray[np.int64], what: str) -> str:
     n = len(t_us)
     if not n:
         return f"no {what}s"
     return f"{n} {what}{'s' * (n != 1)}, {t_us[0] / 1e3:.1f} to {t_us[-1] / 1e3:.1f} ms"
 
 
-def _who(transmitter: int, echo_of: int | None) -> str:
+def _format_transmitter(transmitter: int, echo_of: int | None) -> str:
     return f"transmitter {transmitter}" + ("" if echo_of is None else f", a reflection of {echo_of}")
 
 
-def _symbols(soft: SoftSymbols, most: int = 16) -> str:
-    """The symbols one after another, the first `most` of them; `-` for one that is not given."""
+def _format_symbols(soft: SoftSymbols, most: int = 16) -> str:
     symbols = soft.symbols.tolist()
     text = " ".join(str(s) if s >= 0 else "-" for s in symbols[:most])
     return f"{text} ..." if len(symbols) > most else text
 
 
-def _distance(found: Range) -> str:
-    if math.isnan(found.distance_m):
+def _format_distance(range_: Range) -> str:
+    if math.isnan(range_.distance_m):
         return "no distance"
-    return f"{found.distance_m:.2f} ± {found.sigma_m:.2f} m"
+    return f"{range_.distance_m:.2f} ± {range_.sigma_m:.2f} m"

@@ -164,9 +164,9 @@ class TransmitterTally:
             self.reach_sum += math.log(reach)
             self.sized += 1
             self.along_px = (self.along_px[0] + x, self.along_px[1] + y)
-        if frame.range.bent_px is not None:
-            seen = np.isfinite(frame.range.bent_px)
-            px = np.where(seen, frame.range.bent_px, 0.0)
+        if frame.range.distortion_px is not None:
+            seen = np.isfinite(frame.range.distortion_px)
+            px = np.where(seen, frame.range.distortion_px, 0.0)
             self.bent += 1
             self.bent_px = np.stack([seen, px, px**2]) + (self.bent_px if self.bent_px.size else 0.0)
             self.bent_sigma_m += (frame.range.sigma_m - self.bent_sigma_m) / self.bent

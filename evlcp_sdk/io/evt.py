@@ -179,7 +179,7 @@ class Columns:
         if 2 * self.events < self.room:
             columns = (column.copy() for column in columns)
         edges: Iterator[Any] = (column[: self.triggers] for column in self.trigger_columns)
-        return Events.as_is(*columns), Triggers(*edges) if self.triggers else NO_TRIGGERS
+        return Events.from_columns(*columns), Triggers(*edges) if self.triggers else NO_TRIGGERS
 
 
 class Decoder:

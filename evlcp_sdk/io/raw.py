@@ -18,7 +18,7 @@ from evlcp_sdk.io import _kernels
 from evlcp_sdk.io.evt import EVT2, EVT3, MAX_SIDE, Codec, Columns, Decoder
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.plugin.writer import EventWriter
-from evlcp_sdk.values import Events, Triggers, plain, span_us
+from evlcp_sdk.values import Events, Triggers, span_us, to_kernel_array
 
 CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}
 """The encodings that can be read and written, by name."""
@@ -376,8 +376,8 @@ class RawEncoder:
             self._begun = True
             words, self._state[0] = self._codec.prelude(span_us(events, triggers)[0])
             yield words.tobytes()
-        event_columns = tuple(plain(c) for c in (events.t_us, events.x, events.y, events.p))
-        trigger_columns = tuple(plain(c) for c in (triggers.t_us, triggers.channel, triggers.value))
+        event_columns = tuple(to_kernel_array(c) for c in (events.t_us, events.x, events.y, events.p))
+        trigger_columns = tuple(to_kernel_array(c) for c in (triggers.t_us, triggers.channel, triggers.value))
         i = j = 0
         while i < len(events) or j < len(triggers):
             n, i, j = self._codec.encoder(self._words, self._state, event_columns, i, trigger_columns, j)

@@ -173,13 +173,13 @@ class Positioner:
         if not views:
             return None
         if unplaced and not sited:
-            return Fix.refused(t_us, tuple(views), "no-facing", "; ".join(unplaced))
+            return Fix.from_refusal(t_us, tuple(views), "no-facing", "; ".join(unplaced))
         if here is None or self.axes is None:
             how = [text for number in views if (text := self.bars.contradiction(number))]
             if how:
-                return Fix.refused(t_us, tuple(views), "site-contradicted", "; ".join(how))
+                return Fix.from_refusal(t_us, tuple(views), "site-contradicted", "; ".join(how))
             which = ", ".join(f"{n} (id {self.bars.ids.get(n, 'not received')})" for n in views)
-            return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
+            return Fix.from_refusal(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
         return self._solved(t_us, views, sited, here, self.axes)
 
     def _solved(
@@ -192,7 +192,7 @@ class Positioner:
         if contradicts and self._contradicts is None:
             self._contradicts = sited, attitude_now
         if isinstance(pose, Rejection):
-            refused = Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
+            refused = Fix.from_refusal(t_us, tuple(views), pose.kind, pose.detail)
             others = _alternatives(pose, here, axes)
             return replace(refused, alternatives=others, suspects=pose.suspects)
         turn = axes.turn_from(here)
@@ -216,9 +216,9 @@ class Positioner:
             vpl_m=pose.vpl_m,
             excluded=pose.excluded,
             attitude_sigma_deg=math.degrees(math.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])),
-            along=turn @ pose.along,
+            weakest_axis=turn @ pose.along,
             standing_slope={name: turn @ slope for name, slope in pose.standing_slope.items()},
-            hidden_m=pose.hidden_m if math.isfinite(pose.hpl_m + pose.vpl_m) else np.full(3, math.inf),
+            undetected_m=pose.hidden_m if math.isfinite(pose.hpl_m + pose.vpl_m) else np.full(3, math.inf),
             failed=failed,
         )
 

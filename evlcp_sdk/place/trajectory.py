@@ -496,7 +496,7 @@ def _course(fix: Fix) -> Course:
 
 def _moved(fix: Fix, away_m: Floats) -> Fix:
     """A fix with what errors that stay do to it where its noise is less by so much, float64 (3,)."""
-    along_m, slopes = float(fix.along @ away_m), fix.standing_slope
+    along_m, slopes = float(fix.weakest_axis @ away_m), fix.standing_slope
     moves = {n: m - along_m * slopes[n] if n in slopes else m for n, m in fix.standing.items()}
     return replace(fix, standing=moves)
 
@@ -504,7 +504,9 @@ def _moved(fix: Fix, away_m: Floats) -> Fix:
 def _swayed(fix: Fix) -> bool:
     """Whether its noise changes what errors that stay do to it by as much as matters in a hundred fixes."""
     noise = fix.noise_m2 + fix.slow_m2
-    change = float(fix.along @ noise @ fix.along) * sum([(s * s).sum() for s in fix.standing_slope.values()])
+    change = float(fix.weakest_axis @ noise @ fix.weakest_axis) * sum(
+        [(s * s).sum() for s in fix.standing_slope.values()]
+    )
     return bool(change > _SWAYED * np.trace(noise))
 
 

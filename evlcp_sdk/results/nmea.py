@@ -62,7 +62,7 @@ def sentences(fix: Fix, filtered: Place | None, zero: datetime | None) -> str:
             gga(clock, place, len(fix.transmitters)),
             rmc(clock, place, way),
             gst(clock, math.sqrt(fix.misfit), filtered.covariance_m2),
-            gbs(clock, fix.hidden_m, fix.failed) if fix.source == "bars" else "",
+            gbs(clock, fix.undetected_m, fix.failed) if fix.source == "bars" else "",
         ]
     )
 
@@ -128,22 +128,23 @@ def gst(clock: Clock, misfit: float, covariance_m2: NDArray[np.float64]) -> str:
     )
 
 
-def gbs(clock: Clock, hidden_m: NDArray[np.float64], failed: FailedBar | None = None) -> str:
+def gbs(clock: Clock, undetected_m: NDArray[np.float64], failed: FailedBar | None = None) -> str:
     """A GBS sentence, with its line end: what a fault may hide, and the bar that failed.
 
     Args:
         clock: When.
-        hidden_m: By how much a fault that is not found moves the fix at the most: east, north, up, m, float64
-            (3,); what is not finite is empty.
+        undetected_m: Largest shift of the fix by an undetected fault: east, north, up, m, float64 (3,); what
+            is not finite is left empty.
         failed: The bar that was left out.
 
     >>> gbs(clock_of(1e6, None), np.array([0.5, 0.25, 0.125])).strip()
     '$INGBS,000001.000,0.250,0.500,0.125,,,,*64'
     """
-    east, north, up = (f"{m:.3f}" if math.isfinite(m) else "" for m in hidden_m.tolist())
+    east, north, up = (f"{m:.3f}" if math.isfinite(m) else "" for m in undetected_m.tolist())
     bar = ",,,"
     if failed is not None:
-        bar = f"{failed.transmitter:02d},{failed.missed:.4f},{failed.bias_m:.3f},{failed.sigma_m:.3f}"
+        bar = f"{failed.transmitter:02d},{failed.missed_probability:.4f}"
+        bar += f",{failed.bias_m:.3f},{failed.sigma_m:.3f}"
     return _sentence(f"INGBS,{clock[0]},{north},{east},{up},{bar}")
 
 

@@ -15,7 +15,7 @@ from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.regions import Followed
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.utc import ClockZero
-from evlcp_sdk.values import Frame, Region, SyncLock, changed
+from evlcp_sdk.values import Frame, Region, SyncLock, replace_fields
 
 _MOST_LIT = 1024
 """Transmitters that are remembered: those seen last."""
@@ -42,9 +42,9 @@ def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
     """What a stage gives, with the times of the camera's clock."""
     match value:
         case Region():
-            return changed(value, t_us=camera_us(value.t_us))
+            return replace_fields(value, t_us=camera_us(value.t_us))
         case SyncLock():
-            return changed(value, packet_t_us=camera_us(value.packet_t_us))
+            return replace_fields(value, packet_t_us=camera_us(value.packet_t_us))
     return value
 
 

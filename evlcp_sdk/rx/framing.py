@@ -28,7 +28,7 @@ from evlcp_sdk.rx.regions import (
     same_place,
 )
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters, measure_row_delay, retime
-from evlcp_sdk.values import Events, Frame, Region, SyncLock, changed
+from evlcp_sdk.values import Events, Frame, Region, SyncLock, replace_fields
 
 _TAIL_CHIPS = 0.5
 """A frame is whole if the stream goes on for this long after its last edge's events: some come later."""
@@ -258,7 +258,7 @@ class PacketFraming(Framer):
         for ended in list(self._ended):
             known, (x, y), its = ended
             if place is not None and known is None:
-                found = same_place(changed(place, x_px=x, y_px=y), place)
+                found = same_place(replace_fields(place, x_px=x, y_px=y), place)
             else:
                 found = place is None and known == number
             if found:

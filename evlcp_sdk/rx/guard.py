@@ -19,7 +19,7 @@ from evlcp_sdk.errors import ConfigError, PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Filter, Tracker
 from evlcp_sdk.suggestions import hinted
-from evlcp_sdk.values import Bend, PresenceMap, Range, SoftSymbols, SyncLock
+from evlcp_sdk.values import Curvature, PresenceMap, Range, SoftSymbols, SyncLock
 
 _FAR_PACKETS = 64
 """Packets between a lock and the time when it is found; the grid of its packets is counted from it."""
@@ -191,19 +191,21 @@ class Guard:
             self.expect_number(found.sigma_m, "sigma_m", 0.0, math.inf, "a number from 0, or NaN")
         self.expect_number(found.pairs, "pairs", 0, 1 << 32)
         self.expect_number(found.late_chips, "late_chips", -_LATEST_CHIPS, _LATEST_CHIPS)
-        if found.bend is not None:
-            self.expect(found.bend, Bend)
-            shape = np.shape(found.bend.place)
-            for name in ("place", "off", "weight"):
-                self.expect_array(getattr(found.bend, name), f"bend.{name}", shape, "f")
-            if found.bend.wave is not None:
-                self.expect_array(found.bend.wave, "bend.wave", shape, "f")
-            self.expect_number(found.bend.wave_m, "bend.wave_m", -_FARTHEST_M, _FARTHEST_M)
-            if not _unknown(found.bend.spacing_px):
-                self.expect_number(found.bend.spacing_px, "bend.spacing_px", 0.0, math.inf)
-                self.expect_number(found.bend.one_px, "bend.one_px", 0.0, math.inf)
+        if found.curvature is not None:
+            self.expect(found.curvature, Curvature)
+            shape = np.shape(found.curvature.place)
+            for name in ("place", "offset", "weight"):
+                self.expect_array(getattr(found.curvature, name), f"curvature.{name}", shape, "f")
+            if found.curvature.phase_bias is not None:
+                self.expect_array(found.curvature.phase_bias, "curvature.phase_bias", shape, "f")
+            self.expect_number(
+                found.curvature.phase_bias_m, "curvature.phase_bias_m", -_FARTHEST_M, _FARTHEST_M
+            )
+            if not _unknown(found.curvature.spacing_px):
+                self.expect_number(found.curvature.spacing_px, "curvature.spacing_px", 0.0, math.inf)
+                self.expect_number(found.curvature.unit_px, "curvature.unit_px", 0.0, math.inf)
             if len(shape) != 1:
-                self.refuse(f"bend.place of shape {shape}", "one number a boundary")
+                self.refuse(f"curvature.place of shape {shape}", "one number a boundary")
 
     def expect_filtered(self, values: object, sigma: object, shape: tuple[int, ...]) -> None:
         """Check what a filter of tracking gave: finite values of this shape, and a sigma."""

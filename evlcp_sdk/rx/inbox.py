@@ -17,7 +17,7 @@ from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.trust import BeaconJudge, Standing, signed_text
 from evlcp_sdk.utc import ClockZero, zero_at
-from evlcp_sdk.values import Packet, ReceivedMessage, changed
+from evlcp_sdk.values import Packet, ReceivedMessage, replace_fields
 
 _LLR_POWER, _MOST_LLR = 0.5, 7.0
 """Power that sizes of LLRs are raised to, as decoders are surer within a burst than they are right, and the
@@ -182,7 +182,7 @@ class MessageAssembler:
             self.counts["blocks_other_codebook"] += 1
             return packet
         messages = tuple(self._take(inbox, block, packet))
-        return changed(packet, block=block, block_packets=packets, messages=messages)
+        return replace_fields(packet, block=block, block_packets=packets, messages=messages)
 
     def close(self) -> None:
         """End the stream: what is still incomplete counts as missing."""

@@ -17,7 +17,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.regions import same_place
 from evlcp_sdk.rx.rhythm import Rhythm
-from evlcp_sdk.values import Frame, Packet, Region, changed
+from evlcp_sdk.values import Frame, Packet, Region, replace_fields
 
 _CLEARLY = 1.25
 """How many times more light one link explains than another before nothing else matters."""
@@ -192,14 +192,14 @@ class SeveralLinks:
             ((a, b) for a in one.packet.frames for b in other.packet.frames),
             key=lambda pair: abs(pair[0].t_us - pair[1].t_us),
         )
-        here = _grown(changed(one.place, x_px=a.x_px, y_px=a.y_px), self._gap_px)
-        there = _grown(changed(other.place, x_px=b.x_px, y_px=b.y_px), self._gap_px)
+        here = _grown(replace_fields(one.place, x_px=a.x_px, y_px=a.y_px), self._gap_px)
+        there = _grown(replace_fields(other.place, x_px=b.x_px, y_px=b.y_px), self._gap_px)
         return same_place(here, there)
 
 
 def _grown(place: Region, by_px: float) -> Region:
     """A place that is wider and higher."""
-    return changed(place, width_px=place.width_px + by_px, height_px=place.height_px + by_px)
+    return replace_fields(place, width_px=place.width_px + by_px, height_px=place.height_px + by_px)
 
 
 class EarlyFrames:

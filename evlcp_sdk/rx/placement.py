@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.values import PresenceMap, changed
+from evlcp_sdk.values import PresenceMap, replace_fields
 
 _LEAST_SPACING_PX = 1.0
 """A placement that puts neighbours into one pixel would fit anything."""
@@ -227,7 +227,7 @@ def lit(
     place, least = (presence.prior, presence.grid_px, placement.seen), _LEAST_LIGHT
     if not _kernels.measure_pilot_light(sums, edges, every, *place, least, (light, seen)):
         presence = without(presence, ~seen)
-    return presence, changed(placement, seen=seen)
+    return presence, replace_fields(placement, seen=seen)
 
 
 def without(presence: PresenceMap, clusters: NDArray[np.bool_]) -> PresenceMap:
@@ -236,7 +236,7 @@ def without(presence: PresenceMap, clusters: NDArray[np.bool_]) -> PresenceMap:
     kept = {name: image.copy() for name, image in images.items() if image is not None}
     for image in kept.values():
         image[clusters] = 0
-    return changed(presence, **kept)
+    return replace_fields(presence, **kept)
 
 
 def turned(layout: Layout, mirrored: bool) -> NDArray[np.complex128]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.straight import ALIKE, STRAIGHT, WAVE_PX, Image, judge_image
 from evlcp_sdk.scene.lean import BarSight
-from evlcp_sdk.values import Bend, Range
+from evlcp_sdk.values import Curvature, Range
 
 _MEMORY_S = 0.3
 """Distances that are looked back on: a bicycle's swerve or a brake changes the acceleration in no less."""
@@ -67,7 +67,7 @@ class Ranges(NamedTuple):
         told: The attitude gave how the bar leans then.
         wave: Sums that say how high the pixels' wave is, of `_kernels.add_phase_bias`, float64 (4,).
         image: How straight the bar's image is.
-        off: How far boundaries lie off, as in `Bend`, beyond the lean that is known, in the newest frame, NaN
+        off: How far boundaries lie off, as in `Curvature`, beyond the known lean, in the newest frame, NaN
             where unseen, float64 (n,).
     """
 
@@ -124,20 +124,23 @@ class RangeKeeper:
         t_s, late_s = t_us * 1e-6, measured.late_chips * chip_us * 1e-6
         bend, bend_s, told, wave, image = state.bend, state.bend_s, state.told, state.wave, STRAIGHT
         height, unsure_m, off = (0.0, WAVE_PX**2), 0.0, state.off
-        if measured.bend is not None:
+        if measured.curvature is not None:
             faded = math.exp(-max(t_s - bend_s, 0.0) / _TILT_MEMORY_S) if bend.size else 0.0
-            new = _weighed(measured.bend, (sight.sine or 0.0) + sight.bow)
+            new = _weighed(measured.curvature, (sight.sine or 0.0) + sight.bow)
             goes_on = bend.shape == new.shape and told == (sight.sine is not None)
             bend, bend_s, told = new + faded * bend if goes_on else new, t_s, sight.sine is not None
             wave, off, known = wave * faded, np.empty(new.shape[1]), (bend, state.off)
-            scatter = _kernels.add_phase_bias(measured.bend.place, new, _LEAST_WEIGHT, wave, known, off)
+            scatter = _kernels.add_phase_bias(measured.curvature.place, new, _LEAST_WEIGHT, wave, known, off)
             sums = wave.tolist()
             height = _height(sums)
-            distance_m -= _WAVE_SHARE * height[0] * measured.bend.wave_m
+            distance_m -= _WAVE_SHARE * height[0] * measured.curvature.phase_bias_m
             # The ranging's sigma is of boundaries with the wave.
             sigma_m *= math.sqrt(_left_over(sums, height[0]))
-            unsure_m = math.hypot(_WAVE_SHARE * math.sqrt(height[1]), _WAVE_REST_PX) * measured.bend.wave_m
-            image = judge_image(measured.bend, off, bend, scatter, state.image, t_s)
+            unsure_m = (
+                math.hypot(_WAVE_SHARE * math.sqrt(height[1]), _WAVE_REST_PX)
+                * measured.curvature.phase_bias_m
+            )
+            image = judge_image(measured.curvature, off, bend, scatter, state.image, t_s)
             distance_m *= 1 - image.longer
         sigma_m = max(sigma_m, _LEAST_SIGMA * abs(distance_m))
         old = state.past
@@ -157,7 +160,7 @@ class RangeKeeper:
         standing_m = distance_m * image.sigma
         variance += standing_m**2
         # A bend that no lean makes says nothing of one.
-        newest = None if image.whole else measured.bend
+        newest = None if image.whole else measured.curvature
         length, length_variance = self._leaning(bend, height, newest, sight)
         variance = variance * length**2 + distance_m**2 * length_variance
         found = Range(
@@ -165,12 +168,12 @@ class RangeKeeper:
             math.sqrt(variance),
             measured.pairs,
             standing_m=standing_m * length,
-            bent_px=image.bent_px,
+            distortion_px=image.bent_px,
         )
         return Ranges(past, bend, bend_s, told, wave, image, off), found
 
     def _leaning(
-        self, sums: Floats, wave: tuple[float, float], newest: Bend | None, sight: BarSight
+        self, sums: Floats, wave: tuple[float, float], newest: Curvature | None, sight: BarSight
     ) -> tuple[float, float]:
         """Mean and variance of the foreshortening, by what is likely and by what was seen."""
         likely, sine, told = self._likely, self._sine, 0.0
@@ -194,12 +197,12 @@ class RangeKeeper:
         return np.asarray((1 - share) * (bell / math.sqrt(2 * math.pi)) + share / (2 * _LEANING_DEG))
 
 
-def _weighed(bend: Bend, sine: float) -> Floats:
+def _weighed(curvature: Curvature, sine: float) -> Floats:
     """Weights of a frame's boundaries, and what lies off and the wave by these, without the known lean."""
-    off = bend.off - sine * bend.place**2 if sine else bend.off
+    off = curvature.offset - sine * curvature.place**2 if sine else curvature.offset
     sums = np.empty((3, len(off)))
-    sums[0], sums[1] = bend.weight, bend.weight * off
-    sums[2] = 0.0 if bend.wave is None else bend.weight * bend.wave
+    sums[0], sums[1] = curvature.weight, curvature.weight * off
+    sums[2] = 0.0 if curvature.phase_bias is None else curvature.weight * curvature.phase_bias
     return sums
 
 

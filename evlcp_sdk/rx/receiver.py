@@ -28,7 +28,7 @@ from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.rx.workers import Workers
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.utc import ClockZero
-from evlcp_sdk.values import Events, Frame, Packet, Region, changed
+from evlcp_sdk.values import Events, Frame, Packet, Region, replace_fields
 
 
 class Receiver:
@@ -362,7 +362,7 @@ class LinkReceiver:
             alike = packet.echo_of is None and self._queue.reflections.alike(packet.transmitter)
             self._given["frames_alike"] += len(packet.frames) * alike
             self._given["frames_reflected"] += len(packet.frames) * (packet.echo_of is not None)
-            packet = changed(packet, t_us=self._clock.camera_us(packet.t_us))
+            packet = replace_fields(packet, t_us=self._clock.camera_us(packet.t_us))
             if self._announcer is not None:
                 self._announcer.start()
             if self._messages is not None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.regions import SAME_PX
 from evlcp_sdk.rx.spread import Spread, compare
-from evlcp_sdk.values import Frame, Packet, changed
+from evlcp_sdk.values import Frame, Packet, replace_fields
 
 FOLLOWED_CHIPS = 2.5
 """The last events of a frame come late, some later than its clock says: it is whole if its light goes on for
@@ -352,7 +352,7 @@ class PacketAssembler:
         many = len(self._frames) + sum(len(packet.frames) for packet in self._done)
         self._frames = [one for one in self._frames if (one.packet, one.frame) <= last]
         kept = [
-            changed(packet, frames=tuple(f for f in packet.frames if (f.packet, f.frame) <= last))
+            replace_fields(packet, frames=tuple(f for f in packet.frames if (f.packet, f.frame) <= last))
             for packet in self._done
         ]
         self._done = [packet for packet in kept if packet.frames]
@@ -367,7 +367,7 @@ class PacketAssembler:
         if not self._frames:
             return []
         first, echo_of = self._frames[0], self._frames[-1].echo_of
-        frames = [f if f.echo_of == echo_of else changed(f, echo_of=echo_of) for f in self._frames]
+        frames = [f if f.echo_of == echo_of else replace_fields(f, echo_of=echo_of) for f in self._frames]
         packet = Packet(first.transmitter, first.packet, *self._start, tuple(frames), self._sent)
         self._frames = []
         return [packet]
@@ -436,5 +436,5 @@ class ReflectionQueue:
             return []
         echo_of = self.reflections.echo_of(frame.transmitter)
         if echo_of != frame.echo_of:
-            frame = changed(frame, echo_of=echo_of)
+            frame = replace_fields(frame, echo_of=echo_of)
         return packets.add(frame, one.packet_us, one.chip_us)

@@ -257,7 +257,7 @@ class Rhythm:
         for many in ends:
             end = begin + many
             inside = t_us[begin:end].copy(), x[begin:end].copy(), y[begin:end].copy(), p[begin:end].copy()
-            found.append(Events.as_is(*inside))
+            found.append(Events.from_columns(*inside))
             begin += apart
         return found
 

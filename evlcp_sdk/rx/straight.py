@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.values import Bend
+from evlcp_sdk.values import Curvature
 
 Floats = NDArray[np.float64]
 
@@ -104,20 +104,20 @@ STRAIGHT = Image()
 
 
 def judge_image(
-    bend: Bend, off: Floats, sums: Floats, scatter: tuple[float, ...], before: Image, t_s: float
+    curvature: Curvature, off: Floats, sums: Floats, scatter: tuple[float, ...], before: Image, t_s: float
 ) -> Image:
     """Judge a frame by how its boundaries lie off, and did in those before as far as it looks like them.
 
     Args:
-        bend: Of the frame.
+        curvature: Of the frame.
         off: How far its boundaries lie off beyond the lean that is known, float64 (n,), NaN where unseen.
         sums: Their weights over the frames of the last second, and what lies off, weighted, (2 or more, n).
         scatter: Of these, as of `_kernels.add_phase_bias`.
         before: The frame before.
         t_s: When it is, s.
     """
-    px, (squares, of_means, of_waves, moved, frames) = bend.one_px, scatter
-    if not px * bend.spacing_px > 0:
+    px, (squares, of_means, of_waves, moved, frames) = curvature.unit_px, scatter
+    if not px * curvature.spacing_px > 0:
         return STRAIGHT
     # What two frames differ by has twice the variance, whose median this is.
     noise_px = _ROUGH_PX if math.isnan(moved) else 1.4826 / math.sqrt(2) * moved * px
@@ -125,7 +125,7 @@ def judge_image(
     # Where the image stands still, so does the pixels' wave.
     standing_px = math.hypot(_STANDING_PX, WAVE_PX * px * math.sqrt(of_waves / len(off)))
     mean_px = math.hypot(standing_px, noise_px * math.sqrt(ALIKE / frames))
-    left_out = bend.off * (bend.weight == 0)
+    left_out = curvature.offset * (curvature.weight == 0)
     shown_px = np.where(left_out != 0, left_out, off) * px if left_out.any() else None
     fading = before.fading and before.fading * math.exp((before.t_s - t_s) / _MEMORY_S)
     # Most frames, and their means, are well below what is asked of them.
@@ -134,42 +134,46 @@ def judge_image(
             return STRAIGHT
         return Image(0.0, fading, shown_px, t_s=t_s, fading=fading)
     if before.learnt.shape[1] != len(off):
-        mean = sums[1] / np.maximum(sums[0], 1e-300) * (px / bend.spacing_px)
+        mean = sums[1] / np.maximum(sums[0], 1e-300) * (px / curvature.spacing_px)
         before = before._replace(t_s=t_s, learnt=np.array([mean, frames * (sums[0] > 0)]))
-    turn, learnt = _learn(bend, off, alone_px, before, t_s)
+    turn, learnt = _learn(curvature, off, alone_px, before, t_s)
     noise_px = min(math.hypot(standing_px, noise_px * math.sqrt(ALIKE / learnt[1].max())), alone_px)
     known, seen = learnt[1] > 0.5, off == off
-    found = straighten(bend.place[known], learnt[0, known] * bend.spacing_px, noise_px, _STEEPEST * px)
+    found = straighten(
+        curvature.place[known], learnt[0, known] * curvature.spacing_px, noise_px, _STEEPEST * px
+    )
     if found is None:
         return Image(0.0, fading, shown_px, False, t_s, learnt, fading)
     bent_px = np.where(left_out != 0, left_out * px, np.nan)
     bent_px[seen] = found.rest_px[seen[known]]
-    sigma = math.sqrt(found.variance) / bend.spacing_px
+    sigma = math.sqrt(found.variance) / curvature.spacing_px
     if found.together and before.whole:
         fading = max(fading, min(sigma, before.sigma))
-    longer, sigma = turn + found.slope / bend.spacing_px, max(sigma, fading)
+    longer, sigma = turn + found.slope / curvature.spacing_px, max(sigma, fading)
     return Image(longer, sigma, bent_px, found.together, t_s, learnt, fading)
 
 
-def _learn(bend: Bend, off: Floats, noise_px: float, before: Image, t_s: float) -> tuple[float, Floats]:
+def _learn(
+    curvature: Curvature, off: Floats, noise_px: float, before: Image, t_s: float
+) -> tuple[float, Floats]:
     """Add a frame's boundaries to those before; by how much its line is steeper than theirs, in spacings.
 
     LEDs that are dark move with the bar, and boundaries lie off alike in all frames. What stands in the image
     does not, and what was learnt is worth the less, the more a frame differs.
     """
     seen = off == off
-    frame = np.where(seen, off, 0.0) * (bend.one_px / bend.spacing_px)
+    frame = np.where(seen, off, 0.0) * (curvature.unit_px / curvature.spacing_px)
     mean, worth = before.learnt
     both = seen * (worth > 0)
     n = float(both.sum())
     if n < _FEWEST:
         return 0.0, np.array([frame, seen])
-    at = bend.place - both @ bend.place / n
+    at = curvature.place - both @ curvature.place / n
     differs, arms = (frame - mean) * both, float(both @ at**2)
     level, turn = float(differs.sum()) / n, float(differs @ at) / arms
     squares = float(differs @ differs) - n * level**2 - arms * turn**2
     worth = worth * math.exp((before.t_s - t_s) / _LEARN_S)
-    worth /= 1 + worth * max(squares * bend.spacing_px**2 / _most(noise_px, n) - 1, 0.0)
+    worth /= 1 + worth * max(squares * curvature.spacing_px**2 / _most(noise_px, n) - 1, 0.0)
     share = seen / (worth + 1)
     return turn, np.array([mean + share * (frame - level - turn * at - mean), worth + seen])
 

@@ -24,7 +24,7 @@ from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.reading import Bars, BarState
 from evlcp_sdk.rx.reflections import LONGEST_ROW_US, PacketAssembler
 from evlcp_sdk.rx.regions import Followed, Places
-from evlcp_sdk.values import Events, SyncLock, changed
+from evlcp_sdk.values import Events, SyncLock, replace_fields
 
 LOOKBACK_PACKETS = 2
 """Packets of events kept while there is no lock: one to find a preamble in, one to look back on."""
@@ -164,7 +164,7 @@ class RowDelay:
 
     def delayed(self, lock: SyncLock, height_px: float) -> SyncLock:
         """A lock with this delay, of a bar of some height."""
-        return changed(lock, row_us=self.row_us, last_row_us=abs(self.row_us) * height_px / 2)
+        return replace_fields(lock, row_us=self.row_us, last_row_us=abs(self.row_us) * height_px / 2)
 
 
 def measure_row_delay(
@@ -212,7 +212,9 @@ def retime(lock: SyncLock, start_us: float, pieces: Iterable[tuple[int, Events]]
     if abs(turn) < _NEAR * total or abs(late) <= _OFF_CHIPS:
         return lock
     late_us = (late - 1 if late > 0 else late) * lock.chip_us
-    return changed(lock, delay_on_us=lock.delay_on_us + late_us, delay_off_us=lock.delay_off_us + late_us)
+    return replace_fields(
+        lock, delay_on_us=lock.delay_on_us + late_us, delay_off_us=lock.delay_off_us + late_us
+    )
 
 
 @dataclass

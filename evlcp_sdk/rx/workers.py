@@ -304,7 +304,7 @@ def _decode(
 ) -> FrameResult | Exception | None:
     """What a frame says, or what failed."""
     job.region.pieces = deque(
-        (start_us, Events.as_is(*_columns_at(memory, begin, many))) for start_us, begin, many in pieces
+        (start_us, Events.from_columns(*_columns_at(memory, begin, many))) for start_us, begin, many in pieces
     )
     try:
         found = bars.decode(bar, job)()

@@ -14,7 +14,7 @@ from evlcp_sdk.air.codebook import Codebook, are_pairs
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Synchronization
-from evlcp_sdk.values import SyncLock, plain
+from evlcp_sdk.values import SyncLock, to_kernel_array
 
 Floats = NDArray[np.float64]
 
@@ -215,7 +215,7 @@ class BarkerSynchronizer:
         counts = np.empty((2, bins + 1))
         locks: list[SyncLock] = []
         where = first_bin, self._bin_us, first_bin - before_bin
-        _kernels.count_bins(plain(t_us), plain(p), where, before, counts)
+        _kernels.count_bins(to_kernel_array(t_us), to_kernel_array(p), where, before, counts)
         if lags - guard > lo:
             rho, peaks = np.empty(lags), np.empty(lags - guard - lo, np.int64)
             _kernels.correlate(counts, self._chips, self._due, _STEPS, _MIN_EVENTS, rho)

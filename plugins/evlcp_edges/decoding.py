@@ -71,7 +71,7 @@ class EdgeDecoding(Decoding):
         ) -> SoftSymbols:
             clipped = np.clip(sums, -most, most).astype(np.int64) + most
             shown, seen = _histograms(
-                presence.informed(), clipped, 2 * most + 1, self.min_weight, pilot_chips
+                presence.apply_prior(), clipped, 2 * most + 1, self.min_weight, pilot_chips
             )
             unknown = np.full(len(seen), -1, np.int8)
             behind, ahead = (unknown if sent is None else sent for sent in (before, after))

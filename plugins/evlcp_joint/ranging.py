@@ -16,7 +16,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import Bend, FrameView, Range, changed, plain
+from evlcp_sdk.values import Curvature, FrameView, Range, replace_fields, to_kernel_array
 
 _NONE = Range(float("nan"), float("nan"), 0)
 
@@ -122,8 +122,8 @@ class JointScaleRanging(Ranging):
             if spacing < 0:
                 # A bar upside down is mirrored.
                 spacing, first = -spacing, height - 1 - first
-                values, offset_px = plain(values[:, ::-1]), -offset_px
-            decoded = pilots, words, plain(view.soft.symbols), seen
+                values, offset_px = to_kernel_array(values[:, ::-1]), -offset_px
+            decoded = pilots, words, to_kernel_array(view.soft.symbols), seen
             centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
             fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0, 0.0, 0.0])
             (variance, seen_boundaries, wider_px), by_boundary = _kernels.fit_bar(
@@ -137,21 +137,21 @@ class JointScaleRanging(Ranging):
             # Rows measure the bar along one axis; a tilted bar is longer by its slope.
             stretch = math.hypot(1.0, tilt)
             distance = camera.distance_m(spacing_m, spacing_px * stretch)
-            one_px = spacing_m * spacing_px * stretch / distance
-            off, weight, wave = by_boundary[:, 1:-1]
+            unit_px = spacing_m * spacing_px * stretch / distance
+            off, weight, phase_bias = by_boundary[:, 1:-1]
             return Range(
                 distance,
                 distance * math.sqrt(variance) / spacing_px,
                 seen_boundaries,
                 late_chips,
-                Bend(
+                Curvature(
                     boundaries.copy(),
-                    off / one_px,
-                    weight * one_px**2,
-                    wave / one_px,
+                    off / unit_px,
+                    weight * unit_px**2,
+                    phase_bias / unit_px,
                     -distance * wider_px / spacing_px,
                     spacing_px,
-                    one_px,
+                    unit_px,
                 ),
             )
 
@@ -167,11 +167,11 @@ def find_bar(
         Sums of the first `chips` chips and the offset of the bar along itself in each, turned so that it lies
         along the rows; its line, float64 (5,), as `_kernels.read_rows` takes it; and which clusters are seen.
     """
-    selected, sums = plain(view.presence.selected), plain(view.sums[:chips])
-    offset_px, middles = plain(view.offset_px[1, :chips]), np.empty((len(selected), 2))
+    selected, sums = to_kernel_array(view.presence.selected), to_kernel_array(view.sums[:chips])
+    offset_px, middles = to_kernel_array(view.offset_px[1, :chips]), np.empty((len(selected), 2))
     if _kernels.find_middles(selected, middles):
-        selected, sums = plain(selected.swapaxes(1, 2)), plain(sums.swapaxes(1, 2))
-        offset_px, middles = plain(view.offset_px[0, :chips]), plain(middles[:, ::-1])
+        selected, sums = to_kernel_array(selected.swapaxes(1, 2)), to_kernel_array(sums.swapaxes(1, 2))
+        offset_px, middles = to_kernel_array(view.offset_px[0, :chips]), to_kernel_array(middles[:, ::-1])
     line, seen = np.empty(5), np.empty(len(selected), np.bool_)
     found = _kernels.find_line(selected, view.presence.grid_px, middles, line, seen)
     return (sums, offset_px, line, seen) if found else None
@@ -197,10 +197,10 @@ def profile(core_share: float) -> Floats:
 def _part(view: FrameView, clusters: NDArray[np.int64]) -> FrameView:
     """What a view shows of some of the clusters, the first of them first."""
     presence, soft = view.presence, view.soft
-    return changed(
+    return replace_fields(
         view,
-        presence=changed(presence, selected=presence.selected[clusters]),
-        soft=changed(soft, symbols=soft.symbols[clusters]),
+        presence=replace_fields(presence, selected=presence.selected[clusters]),
+        soft=replace_fields(soft, symbols=soft.symbols[clusters]),
     )
 
 

@@ -16,7 +16,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import FrameView, Range, plain
+from evlcp_sdk.values import FrameView, Range, to_kernel_array
 
 _NONE = Range(float("nan"), float("nan"), 0)
 
@@ -135,7 +135,7 @@ class PocRanging(Ranging):
         least = min(self.min_pairs, max(len(known_pairs(b"\1" * bar.clusters)[0]), 1))
 
         def measure(view: FrameView) -> Range:
-            maps, middles = plain(view.presence.pixels), np.empty((bar.clusters, 2), np.int64)
+            maps, middles = to_kernel_array(view.presence.pixels), np.empty((bar.clusters, 2), np.int64)
             px_per_m, *lit_px = _kernels.find_middles(maps, apart, self.min_pixels, middles)
             far = known_pairs((middles[:, 0] >= 0).tobytes())
             if len(far[0]) < least or px_per_m <= 0:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.plugin.roles import Decode, Decoding
-from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
+from evlcp_sdk.values import PresenceMap, SoftSymbols, to_kernel_array
 from evlcp_wh import _kernels
 
 _MIN_WEIGHT, _MIN_LEARNT_WEIGHT = 0.01, 0.05
@@ -65,9 +65,9 @@ class WhTransform(Decoding):
         pilot_chips, length = codebook.pilots.shape[1], len(by_value)
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
-            probability = plain(presence.probability)
+            probability = to_kernel_array(presence.probability)
             values = np.zeros((len(probability), length))
-            info = plain(sums[pilot_chips:])
+            info = to_kernel_array(sums[pilot_chips:])
             _kernels.weighted_values(info, probability, presence.grid_px, _MIN_WEIGHT, values)
             symbols, best, margins, _, _ = match_words(values, by_value, codebook.bits_per_symbol)
             energy, explained = float(np.vdot(values, values)), float(best @ best) / length
@@ -98,7 +98,7 @@ class MlSoft(Decoding):
         decoder = LearnedDecoder(codebook)
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
-            return decoder.decode(presence.informed(), sums)[0]
+            return decoder.decode(presence.apply_prior(), sums)[0]
 
         return decode
 
@@ -129,9 +129,11 @@ class LearnedDecoder:
             the log-likelihood ratio of a value of +1 against -1 by its pair, float64 ((2 n + 1)^2,).
         """
         pairs = np.empty((len(sums) // 2, sums[0].size), np.uint8)
-        seen, width, grid = plain(presence.probability), sums.shape[2], presence.grid_px
+        seen, width, grid = to_kernel_array(presence.probability), sums.shape[2], presence.grid_px
         worth = np.empty((2 * MAX_EVENTS + 1) ** 2)
-        _kernels.learn_worth(plain(sums), MAX_EVENTS, self._signs, seen, grid, _PRIOR_COUNT, pairs, worth)
+        _kernels.learn_worth(
+            to_kernel_array(sums), MAX_EVENTS, self._signs, seen, grid, _PRIOR_COUNT, pairs, worth
+        )
         values = np.zeros((len(seen), len(pairs) - self._signs.shape[1]))
         odds = (1 - _PIXEL_SHARE) / _PIXEL_SHARE
         _kernels.sum_worth(pairs, width, self._signs, seen, grid, worth, (_MIN_LEARNT_WEIGHT, odds), values)

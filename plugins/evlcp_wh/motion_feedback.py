@@ -11,7 +11,7 @@ from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.plugin.roles import Decode, Decoding
-from evlcp_sdk.values import PresenceMap, SoftSymbols, changed, plain
+from evlcp_sdk.values import PresenceMap, SoftSymbols, replace_fields, to_kernel_array
 from evlcp_wh import _kernels
 from evlcp_wh.decoding import INDEPENDENT_PIXELS, LearnedDecoder
 from evlcp_wh.separation import CellPosterior
@@ -61,10 +61,10 @@ class MotionFeedback(Decoding):
         """Precompute for a codebook's pilots and codewords."""
         codebook.require_pairs("decoding", "motion-feedback", "edges")
         decoder, posterior = LearnedDecoder(codebook), CellPosterior(codebook.pilot_edges.astype(np.int64))
-        pilots, words = plain(codebook.pilot_edges), codebook.codeword_edges
+        pilots, words = to_kernel_array(codebook.pilot_edges), codebook.codeword_edges
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
-            presence, sums = presence.informed(), plain(sums)
+            presence, sums = presence.apply_prior(), to_kernel_array(sums)
             soft, least, pairs, worth = decoder.decode(presence, sums)
             if least >= _SURE_LLR:
                 return soft
@@ -97,7 +97,7 @@ class MotionFeedback(Decoding):
                     break
                 still, done = take_back(sums, path), path
                 probability = posterior.probability(still, presence.grid_px)
-                presence = changed(presence, probability=probability).informed()
+                presence = replace_fields(presence, probability=probability).apply_prior()
                 soft, least, *_ = decoder.decode(presence, still)
                 known = np.concatenate([pilots, words[soft.symbols]], axis=1)
             return soft, least < _UNSURE_LLR
@@ -118,8 +118,8 @@ def match_shifts(
     prior = presence.probability if presence.prior is None else presence.prior
     side = 2 * reach_px + 1
     out = np.zeros((len(prior), side, side, len(pairs)), np.float32)
-    maps, grid = plain(presence.pixels), presence.grid_px
-    _kernels.match_shifts(pairs, worth, INDEPENDENT_PIXELS, maps, plain(prior), grid, out)
+    maps, grid = to_kernel_array(presence.pixels), presence.grid_px
+    _kernels.match_shifts(pairs, worth, INDEPENDENT_PIXELS, maps, to_kernel_array(prior), grid, out)
     return out
 
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.plugin.roles import Separate, Separation
-from evlcp_sdk.values import PresenceMap, plain
+from evlcp_sdk.values import PresenceMap, to_kernel_array
 from evlcp_wh import _kernels
 
 _VALUE_ERROR = 0.1
@@ -59,7 +59,7 @@ class WhCorrelation(Separation):
         posterior = CellPosterior(codes)
 
         def separate(sums: NDArray[np.int16]) -> PresenceMap:
-            sums = plain(sums)
+            sums = to_kernel_array(sums)
             probability = posterior.probability(sums, self.grid_px)
             selected, grid = np.empty(probability.shape, np.bool_), self.grid_px
             pixels = np.zeros((len(codes), *sums.shape[1:]), np.float32)

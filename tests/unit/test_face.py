@@ -17,8 +17,8 @@ from evlcp_sdk.plugin import roles
 FACE = Path(evlcp.__file__)
 
 FACE_NAMES = """
-    Algorithm Alternative Attitude AttitudeLog BarLayout BarSite Beacon Bend BlockError CameraModel Code
-    Codebook ConfigError Corrected Decode Decoding Deframer Detection Detector
+    Algorithm Alternative Attitude AttitudeLog BarLayout BarSite Beacon BlockError CameraModel Code
+    Codebook ConfigError Corrected Curvature Decode Decoding Deframer Detection Detector
     ErrorCorrection EventSource Events EvlcpError FailedBar Filter Fix Frame FrameView Framing GnssLog
     DecodedFrame InputError InterruptedRunError LedColumns LedGrid LedRing LedTable Link Loss Measure Message
     MessageKind Modulation OutputError Packet PacketFormat Pilots Place PluginError PluginWarning

@@ -60,7 +60,7 @@ def packet(*messages: ReceivedMessage) -> Packet:
         (frame(), "Frame(transmitter 0, packet 1, frame 3, 66.1 ms, 23 18 8 51, 49.34 ± 0.09 m)"),
         (packet(text_message("a")), "Packet(transmitter 0, packet 1, 60.0 ms, 2 of 10 frames, 1 message)"),
         (text_message("x" * 900), f"ReceivedMessage('{'x' * 60}...' from 7, unverified, 66.0 ms)"),
-        (Fix.refused(5e3, (0,), "one-bar", "a single bar"), "Fix(5.0 ms, refused: one-bar)"),
+        (Fix.from_refusal(5e3, (0,), "one-bar", "a single bar"), "Fix(5.0 ms, refused: one-bar)"),
         (FIX, "Fix(5.0 ms, 35.1000000, 137.2000000 deg, 50.00 m, ± 0.1 E 0.2 N 1 U m)"),
     ],
     ids=lambda v: type(v).__name__ if not isinstance(v, str) else "",

@@ -206,10 +206,10 @@ def test_what_the_figures_of_a_transmitter_say(figures: dict[str, Any], decoded:
 )
 def test_a_bent_image(off_px: dict[int, float], said: str) -> None:
     """Boundary 2, between clusters 2 and 3, is up the bar: cluster 2 lacks light."""
-    bent_px = np.zeros(15)
-    bent_px[list(off_px)] = list(off_px.values())
-    bent_px[5] = np.nan
-    tally = tally_of(RANDOM, range=Range(50.0, 0.1, 15, bent_px=bent_px))
+    off_straight_px = np.zeros(15)
+    off_straight_px[list(off_px)] = list(off_px.values())
+    off_straight_px[5] = np.nan
+    tally = tally_of(RANDOM, range=Range(50.0, 0.1, 15, distortion_px=off_straight_px))
     found = find(Facts(LINK, tally, {}))
     assert [(doubt.code, said in doubt.text) for doubt in found] == [("image-bent", True)] * bool(said)
     # In a few of its frames.

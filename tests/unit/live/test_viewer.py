@@ -183,7 +183,7 @@ def test_one_that_stalls_costs_the_others_nothing(stage: Stage) -> None:
 
 
 def test_what_was_before_is_told_to_who_comes_later(stage: Stage) -> None:
-    fix = Fix.refused(5e3, (0,), "misfit", "why")
+    fix = Fix.from_refusal(5e3, (0,), "misfit", "why")
     stage.publisher.publish("fix", fix.t_us, Placed(fix, None))
     enu_m, unit = np.array([3.0, -20.0, -1.0]), np.eye(3)
     where = [float(v) for v in LocalAxes.of([SITE]).to_geodetic(enu_m)]

@@ -37,7 +37,7 @@ def frame(points_px, sigma_px, t_us, transmitter=0, packet=0, number=0) -> Frame
 def fix(t_us: float, enu_m: Floats, noise_m2: Floats, **more: Any) -> Fix:
     """A fix of one bar whose errors are new each time; `more` of it."""
     given = {"enu_m": enu_m, "noise_m2": noise_m2, "covariance_m2": noise_m2, **more}
-    return replace(Fix.refused(t_us, (0,), "", ""), **given)
+    return replace(Fix.from_refusal(t_us, (0,), "", ""), **given)
 
 
 def square(error: Floats, covariance: Floats) -> float:

@@ -220,7 +220,7 @@ def test_where_a_left_out_bar_stands_is_the_weighted_fit_of_its_points(across: f
     assert isinstance(problem, Problem)
     found = estimate_fault(problem, 1, pose, 30.0, 5)
     limit = stats.chi2.isf(spec.false_alarm / 2 / 5, 6)
-    assert found.missed == pytest.approx(stats.ncx2.cdf(limit, 6, 30.0))
+    assert found.missed_probability == pytest.approx(stats.ncx2.cdf(limit, 6, 30.0))
     way = wrong.points_px[-1] - wrong.points_px[0]
     size = float(np.linalg.norm(way))
     way = way / size

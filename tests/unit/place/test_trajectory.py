@@ -35,7 +35,7 @@ def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
     fixes = [fix(i * 1e5, np.array([float(i), 0, 0]), NOISE_M2) for i in range(10)]
     fixes[5] = fix(5e5, np.array([50.0, 0, 0]), NOISE_M2)
     # A refused one has no point.
-    points = filter_fixes([*fixes, Fix.refused(1e6, (0,), "misfit", "far off")], SPEC)
+    points = filter_fixes([*fixes, Fix.from_refusal(1e6, (0,), "misfit", "far off")], SPEC)
     assert [p.misses for p in points] == [0, 0, 0, 0, 0, 1, 0, 0, 0, 0]
     assert abs(points[5].mean[0] - 5) < 0.5
     jumped = fixes[:5] + [fix((5 + i) * 1e5, np.array([1000.0 + i, 0, 0]), NOISE_M2) for i in range(15)]
@@ -163,7 +163,7 @@ def swayed(rng: np.random.Generator, fixes: int) -> tuple[list[Fix], Floats]:
         given = seen + rng.normal(0, noise_m, 3)
         moves = base + slope * (along @ given)
         noise_m2, stays = noise_m**2 * np.eye(3), {"bar 0": moves}
-        whole = {"covariance_m2": noise_m2 + moves @ moves.T, "standing": stays, "along": along}
+        whole = {"covariance_m2": noise_m2 + moves @ moves.T, "standing": stays, "weakest_axis": along}
         found.append(fix(t * 1e6, given, noise_m2, standing_slope={"bar 0": slope}, **whole))
     return found, place
 

@@ -71,7 +71,7 @@ def test_reports_say_what_the_fix_says() -> None:
     assert (report["epx"], report["epy"], report["epv"], report["eph"]) == (0.3, 0.4, 0.5, 0.5)
     assert (report["mode"], report["speed"], report["track"]) == (3, 10.0, 0.0)
     assert sky(fix, ZERO)["satellites"] == [{"PRN": 0, "used": True}, {"PRN": 3, "used": True}]
-    refused = Fix.refused(1e6, (2,), "misfit", "")
+    refused = Fix.from_refusal(1e6, (2,), "misfit", "")
     assert tpv(refused, None, None) == {"class": "TPV", "device": "evlcp", "mode": 1}
     assert sky(refused, None)["uSat"] == 0
 

@@ -165,17 +165,17 @@ def test_covariance_and_integrity_are_in_every_file(tmp_path: Path) -> None:
     root = np.array([[0.3, 0.0, 0.0], [0.1, 0.2, 0.0], [-0.05, 0.02, 0.1]])
     spread = root @ root.T
     fix = dataclasses.replace(
-        Fix.refused(2e6, (0, 1), "", ""),
+        Fix.from_refusal(2e6, (0, 1), "", ""),
         latitude_deg=35.0, longitude_deg=137.0, height_m=5.0, enu_m=np.zeros(3), covariance_m2=spread,
         noise_m2=spread, heading_deg=1.0, pitch_deg=2.0, roll_deg=3.0, heading_sigma_deg=0.1,
         misfit=0.64, freedom=60, hpl_m=1.25, vpl_m=math.inf, excluded=("bar 2", "heading"),
-        hidden_m=np.array([0.5, 0.25, math.inf]),
+        undetected_m=np.array([0.5, 0.25, math.inf]),
         failed=FailedBar(2, np.array([0.3, 0.0, 0.4]), np.diag([0.01, 0.04, 0.01]), 0.0123),
     )  # fmt: skip
-    wrong = Fix.refused(3e6, (0, 1), "misfit", "heading does not fit the rest")
+    wrong = Fix.from_refusal(3e6, (0, 1), "misfit", "heading does not fit the rest")
     assert fix.alarms == ("excluded", "unavailable")
     assert wrong.alarms == ("misfit",)
-    assert Fix.refused(3e6, (0,), "heading-unknown", "").alarms == ()
+    assert Fix.from_refusal(3e6, (0,), "heading-unknown", "").alarms == ()
     point = trajectory_step(None, fix, ErrorModel())
     place = Place(2e6, 35.0, 137.0, 5.0, point.mean[:3], point.covariance_m2, 0.0, 0.0, False, True)
     with ResultFolder(tmp_path, ["fixes.csv", "fixes.nmea", "fixes.geojson"]) as folder:
@@ -262,10 +262,10 @@ def test_the_poses_that_fit_are_a_file(tmp_path: Path) -> None:
         Alternative(35.0, 137.0, 5.0, np.zeros(3), np.eye(3) * 0.04, *turned, 1.0),
         Alternative(35.1, 137.0, 5.0, np.ones(3), np.full((3, 3), math.nan), *turned, 0.25),
     )
-    fix = dataclasses.replace(Fix.refused(2e6, (0, 1), "two-solutions", ""), alternatives=both)
+    fix = dataclasses.replace(Fix.from_refusal(2e6, (0, 1), "two-solutions", ""), alternatives=both)
     with sink_of(AlternativesCsv, tmp_path) as sink:
         sink.fix(fix, None)
-        sink.fix(Fix.refused(3e6, (0,), "heading-unknown", ""), None)
+        sink.fix(Fix.from_refusal(3e6, (0,), "heading-unknown", ""), None)
     first, second = rows_of(tmp_path / "alternatives.csv")
     assert (first["number"], first["likelihood"], first["sigma_up_m"]) == ("0", "1", "0.2000")
     assert (second["latitude_deg"], second["sigma_up_m"], second["bars"]) == ("35.1000000000", "", "0 1")

@@ -15,7 +15,7 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Corrected, Tracker
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.values import Bend, SyncLock
+from evlcp_sdk.values import Curvature, SyncLock
 
 LINK = load_link(overrides=["tracking.id=kalman"])
 _, EVENTS = lit(2)
@@ -137,7 +137,7 @@ def but(**changes):
 
 def bent(**changes):
     """What it says of a lean, of three boundaries, is so."""
-    return but(bend=replace(Bend(*np.ones((3, 3))), **changes))
+    return but(curvature=replace(Curvature(*np.ones((3, 3))), **changes))
 
 
 def spoilt(name, value, kind=None):
@@ -175,9 +175,9 @@ ODD = [
     ("ranging", but(distance_m=0.0), r"distance_m = 0\.0, expected a number above 0 and up to 1e\+15"),
     ("ranging", but(distance_m=10**5000), "distance_m = a int that cannot be shown"),
     ("ranging", but(sigma_m=-1.0), r"sigma_m = -1\.0, expected a number from 0, or NaN"),
-    ("ranging", but(bend=3), "int, expected Bend"),
-    ("ranging", bent(wave=np.zeros(2)), r"bend.wave of shape \(2,\), expected \(3,\)"),
-    ("ranging", but(bend=Bend(*np.ones((3, 3, 1)))), r"bend.place of shape \(3, 1\)"),
+    ("ranging", but(curvature=3), "int, expected Curvature"),
+    ("ranging", bent(phase_bias=np.zeros(2)), r"curvature.phase_bias of shape \(2,\), expected \(3,\)"),
+    ("ranging", but(curvature=Curvature(*np.ones((3, 3, 1)))), r"curvature.place of shape \(3, 1\)"),
     ("tracking", lambda found: (found[0] * math.nan, found[1]), r"values \[nan"),
     ("tracking", lambda found: (found[0][:0], found[1]), r"values of shape \(0,\), expected"),
     ("tracking", lambda found: (found[0], "a lot"), "sigma = 'a lot', expected a number"),

@@ -100,7 +100,7 @@ def test_bayes_cell_by_cell(seed):
     likely = np.where(probability.any(0), probability * 5 / np.maximum(none, 1e-6), 1)
     both = likely * prior
     want = both / (both.sum(0) + np.maximum(1 - prior.sum(0), 1e-6))
-    np.testing.assert_allclose(presence.informed().probability, want, rtol=2e-3, atol=1e-5)
+    np.testing.assert_allclose(presence.apply_prior().probability, want, rtol=2e-3, atol=1e-5)
 
 
 def test_few_clusters_are_enough_where_the_scale_is_known():

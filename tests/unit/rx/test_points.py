@@ -15,7 +15,7 @@ from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.sim import Simulation, load_scene
 from evlcp_sdk.sim.motion import project
-from evlcp_sdk.values import Events, PresenceMap, changed
+from evlcp_sdk.values import Events, PresenceMap, replace_fields
 
 BAR = BarLayout()
 CENTRES = BAR.cluster_centres_m()
@@ -42,7 +42,7 @@ def points_of(presence, centres_m=CENTRES, at_px=(0.0, 0.0), pixels=None, **plac
     light = np.rint(100 * presence.pixels).astype(np.int16)
     heard = np.concatenate([np.zeros_like(light[:1]), light])
     placement = replace(placements(presence, layout)[0], **placed)
-    seen = presence if pixels is None else changed(presence, pixels=pixels)
+    seen = presence if pixels is None else replace_fields(presence, pixels=pixels)
     return points_finder(layout, np.eye(len(light), dtype=np.int64), 1)(seen, placement, heard, at_px)
 
 

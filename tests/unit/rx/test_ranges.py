@@ -10,7 +10,7 @@ from scipy.stats import norm
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
 from evlcp_sdk.rx.straight import straighten
 from evlcp_sdk.scene.lean import BarSight
-from evlcp_sdk.values import Bend, Range
+from evlcp_sdk.values import Curvature, Range
 
 CHIP_US = 100.0
 FRAME_US = 3200.0
@@ -28,7 +28,7 @@ def bend_of(lean_deg, distance_m, noise_px, rng):
     spacing_px = FOCAL_PX * SPACING_M * cosine / distance_m
     off_px = seen_px - spacing_px * PLACES + noise_px * rng.standard_normal(len(PLACES))
     one_px = spacing_px * SPACING_M / distance_m
-    return Bend(PLACES, off_px / one_px, np.full(len(PLACES), one_px**2))
+    return Curvature(PLACES, off_px / one_px, np.full(len(PLACES), one_px**2))
 
 
 def drive(frames, sigma_m, bend_px, seed, *, said_m=None, start_m=50.0, speed_m_s=-10.0, **how):
@@ -130,7 +130,7 @@ def test_a_distance_keeps_nothing_of_old_bends_and_distances():
     rng = np.random.default_rng(5)
     measured = [Range(45.1, 0.01, 15, 8.0, bend_of(4.0, 45.0, 0.04, rng)) for _ in range(400)]
     state, _ = kept(measured)
-    weight = measured[-1].bend.weight
+    weight = measured[-1].curvature.weight
     assert len(state.past) <= 0.3 / (FRAME_US * 1e-6) + 1
     assert state.bend[0].max() < 1.01 * weight.max() / (1 - math.exp(-FRAME_US * 1e-6))
     new, _ = RangeKeeper().step(state, 400 * FRAME_US + 20e6, CHIP_US, measured[-1], AHEAD)
@@ -142,7 +142,7 @@ def frame_of(seem_px, true_m, sigma_m, **more):
     """A frame as a ranging gives it that fits a straight scale to boundaries where they seem to lie."""
     slope, mean = np.polyfit(PLACES, seem_px, 1)
     one_px = FOCAL_PX * (SPACING_M / true_m) ** 2
-    bend = Bend(PLACES, (seem_px - slope * PLACES - mean) / one_px, np.full(15, one_px**2), **more)
+    bend = Curvature(PLACES, (seem_px - slope * PLACES - mean) / one_px, np.full(15, one_px**2), **more)
     return Range(FOCAL_PX * SPACING_M / slope, sigma_m, 15, 8.0, bend)
 
 
@@ -158,7 +158,9 @@ def waves(spacings_px, height_px, rng):
         seem_px = spacing_px * PLACES + height_px * wave + 0.02 * rng.standard_normal(15)
         wave_m = -true_m * np.polyfit(PLACES, wave, 1)[0] / spacing_px
         wave /= spacing_px * SPACING_M / true_m
-        frames.append(frame_of(seem_px, true_m, 0.02 / 16.7 / spacing_px * true_m, wave=wave, wave_m=wave_m))
+        frames.append(
+            frame_of(seem_px, true_m, 0.02 / 16.7 / spacing_px * true_m, phase_bias=wave, phase_bias_m=wave_m)
+        )
     found = kept(frames)[1][-1]
     return found.distance_m - true_m, found.sigma_m, frames[-1].distance_m - true_m, frames[-1].sigma_m
 
@@ -188,7 +190,7 @@ def bent(frames, off_px, rng):
     """Frames of a bar 45 m away whose boundaries seem to lie off by so much, (15,): a scale through all."""
     spacing_px = FOCAL_PX * SPACING_M / 45
     seem_px = spacing_px * PLACES + off_px + 0.04 * rng.standard_normal((frames, 15))
-    more = {"spacing_px": spacing_px, "one_px": spacing_px * SPACING_M / 45}
+    more = {"spacing_px": spacing_px, "unit_px": spacing_px * SPACING_M / 45}
     return [frame_of(one, 45.0, 0.01, **more) for one in seem_px]
 
 
@@ -206,9 +208,9 @@ def test_what_bends_an_image_does_not_average_away(height_px):
     for one in found[-20:]:
         assert one.standing_m > 0.4 * abs(raw.mean())
         assert one.sigma_m > one.standing_m
-        assert one.bent_px is not None
+        assert one.distortion_px is not None
     straight = kept(bent(60, 0 * PLACES, rng))[1]
-    assert all(one.standing_m == 0 and one.bent_px is None for one in straight)
+    assert all(one.standing_m == 0 and one.distortion_px is None for one in straight)
     # Some time after it is gone, nothing is left of it.
     _, again = kept(measured + bent(1500, 0 * PLACES, rng))
     assert again[-1].sigma_m == pytest.approx(straight[-1].sigma_m, rel=0.3)
@@ -224,12 +226,14 @@ def test_clusters_with_dark_leds_are_taken_out_and_shown():
     assert np.abs(error[:, 0]).max() < 0.1
     assert nees(error) < 1
     for one in found:
-        assert np.flatnonzero(np.abs(one.bent_px) > 0.3).tolist() == [1, 2, 8, 13]
+        assert np.flatnonzero(np.abs(one.distortion_px) > 0.3).tolist() == [1, 2, 8, 13]
     # What the ranging left out itself is shown, and changes nothing.
-    bend = measured[0].bend
-    alone = Bend(PLACES, np.eye(15)[3], np.where(PLACES[3] == PLACES, 0, bend.weight), None, 0.0, 9.6, 0.5)
+    bend = measured[0].curvature
+    alone = Curvature(
+        PLACES, np.eye(15)[3], np.where(PLACES[3] == PLACES, 0, bend.weight), None, 0.0, 9.6, 0.5
+    )
     _, (one,) = kept([Range(45.0, 0.01, 14, 8.0, alone)])
-    assert one.bent_px == pytest.approx(0.5 * np.eye(15)[3])
+    assert one.distortion_px == pytest.approx(0.5 * np.eye(15)[3])
     assert one.standing_m == 0
 
 

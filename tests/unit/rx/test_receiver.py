@@ -15,7 +15,7 @@ from evlcp_sdk.rx.framing import SkippedFrame
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
-from evlcp_sdk.values import Events, PresenceMap, changed
+from evlcp_sdk.values import Events, PresenceMap, replace_fields
 
 
 @pytest.mark.parametrize(
@@ -267,7 +267,7 @@ def test_a_frame_says_the_same_at_any_time_of_the_clock(t0_us):
         for a, b in zip(one.frames, other.frames, strict=True):
             times = {name: getattr(b, name) - t0_us for name in ("t_us", "points_t_us")}
             assert times == pytest.approx({name: getattr(a, name) for name in times}, abs=0.25, rel=0)
-            assert said(changed(b, **{name: getattr(a, name) for name in times})) == said(a)
+            assert said(replace_fields(b, **{name: getattr(a, name) for name in times})) == said(a)
 
 
 def test_what_is_dropped_is_counted():

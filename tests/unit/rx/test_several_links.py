@@ -12,7 +12,7 @@ from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.testing.recordings import merged
-from evlcp_sdk.values import changed
+from evlcp_sdk.values import replace_fields
 
 
 def named(name, **sections):
@@ -59,7 +59,9 @@ def test_what_is_heard_alone_is_the_same_with_another_link_beside():
     events = merged(at(BAR, LEFT)[1], at(BAR, RIGHT)[1], noise_events(20_000, 120_000))
     alone, single = received(BAR, events)
     _, both = received([BAR, SLOW], events)
-    assert [said(changed(f, link="bar")) for f in frames_of(single)] == [said(f) for f in frames_of(both)]
+    assert [said(replace_fields(f, link="bar")) for f in frames_of(single)] == [
+        said(f) for f in frames_of(both)
+    ]
     assert {p.link for p in single} == {""}
     assert {p.link for p in both} == {"bar"}
     assert alone.link_counts == {}
