@@ -625,7 +625,7 @@ def calibrate(
                 if (site := who.stands_at.get(number)) is not None:
                     enu = site.layout_positions_m(link.bar, axes)
                     bars.append(
-                        replace(found, transmitter=site.transmitter_id, enu_m=enu, survey=site.survey)
+                        replace(found, transmitter=site.transmitter_id, enu_m=enu, survey=site.survey_sigmas)
                     )
             views.append(_view(pose, bars, axes))
     return fit_camera(views, link.camera, ErrorModel.of(link.position), limit_px=limit_px)
@@ -633,7 +633,7 @@ def calibrate(
 
 def _check_lines(links: Mapping[str, Link]) -> None:
     for name, link in links.items():
-        if not link.bar.in_even_line or link.bar.clusters < 2:
+        if not link.bar.is_even_line or link.bar.clusters < 2:
             which = f"link '{name}': " if name else ""
             raise ConfigError(
                 f"{which}a survey is of bars whose clusters stand evenly in line; write a site.toml by hand"
@@ -656,7 +656,7 @@ def _view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> Calibrat
     place = (pose.latitude_deg, pose.longitude_deg, pose.height_m)
     rotation = None
     if pose.attitude is not None:
-        rotation = axes.turn_from(LocalAxes(*place)) @ pose.attitude.rotation()
+        rotation = axes.rotation_from(LocalAxes(*place)) @ pose.attitude.rotation()
     where = axes.to_enu(*place)
     return CalibrationView(tuple(bars), where, pose.position_sigma_m, rotation, pose.attitude_sigma_deg)
 

@@ -23,7 +23,7 @@ def check_sigmas(facts: Facts) -> Found:
     """What has no sigma, and so is taken as exact."""
     exact = facts.positions["bars_exact"]
     unsaid = [f"bars {', '.join(map(str, exact))} (position_sigma_m in site.toml)"] if exact else []
-    if not facts.link.camera_sigma.known:
+    if not facts.link.camera_sigma.is_known:
         unsaid.append("the camera ([camera_sigma], which evlcp calibrate prints)")
     if unsaid:
         yield Diagnostic(

@@ -344,7 +344,7 @@ class _Resolver:
         """Build what a section describes; give all its keys, None where its algorithm is not known."""
         if section == "bar":
             bar = self.built[section] = BarLayout.of_table(keys)
-            return bar.table()
+            return bar.to_table()
         if section in _SPECS:
             self.built[section] = _built(_SPECS[section], keys, ours=True)
             return asdict(self.built[section])

@@ -158,7 +158,7 @@ class BarRegistry:
         if all(site.link is not None for site in sites):
             rivals = [other for other in rivals if other.link == sent.link]
         alone = len(rivals) == 1
-        return site_of_transmitter(sites, number, sent.transmitter_id, alone=alone)
+        return site_of_transmitter(sites, number, sent.transmitter_id, is_only=alone)
 
     def link_of(self, number: int) -> str:
         """Name of the link that a transmitter's packets have; empty if none was received."""

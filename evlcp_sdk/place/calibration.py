@@ -204,7 +204,7 @@ def calibrate(
     sigma = dict(zip(CAMERA_PARAMETERS, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     # How far the image's farthest corner moves by each.
     corners = np.array([[x, y] for x in (0.0, start.width) for y in (0.0, start.height)])
-    slopes = start.parameter_slope((corners - start.centre_px) / start.focal_px) / own
+    slopes = start.parameter_jacobian((corners - start.centre_px) / start.focal_px) / own
     moved = np.linalg.norm(slopes, axis=1).max(0)
     corner = {name: float(far) * sigma[name] for name, far in zip(CAMERA_PARAMETERS, moved, strict=True)}
     sure = [n for n in CAMERA_PARAMETERS if corner[n] <= limit_px and sigma[n] <= _LEARNT * usual[n]]
@@ -399,7 +399,7 @@ class _Model:
             place[mine] += x[column + 7] * view.bend_px[mine]
         seen = (stands - position) @ rotation
         block = np.zeros((len(place), 2, len(x)))
-        block[:, :, :_OF_CAMERA] = now.parameter_slope(seen[:, :2] / seen[:, 2:]) @ self.root
+        block[:, :, :_OF_CAMERA] = now.parameter_jacobian(seen[:, :2] / seen[:, 2:]) @ self.root
         slope[:, :, 3:] = slope[:, :, 3:] @ _turn_slope(off[3:])
         block[:, :, at : at + 6], block[:, :, -6:] = slope * own, slope * common
         for column, (mine, by_site) in moves.items():

@@ -335,7 +335,7 @@ def linearize(problem: Problem, at: Fit) -> Equations | None:
     weight = huber / np.maximum(size, huber)
     cost = float((np.where(size > huber, huber * (2 * size - huber), size**2)).sum())
     white = even * (np.sqrt(weight) * points[:, 8])[:, None, None]
-    by_sight = white @ camera.distort_slope(direction) / seen[:, 2][:, None, None]
+    by_sight = white @ camera.distortion_jacobian(direction) / seen[:, 2][:, None, None]
     by_point = np.concatenate([by_sight, -by_sight @ direction[:, :, None]], -1) @ at.rotation.T
     rows = np.zeros((len(points), 2, LOCAL + SHARED + 1))
     own_errors, shared = rows[:, :, :LOCAL], rows[:, :, LOCAL:-1]
@@ -349,7 +349,7 @@ def linearize(problem: Problem, at: Fit) -> Equations | None:
     by_focal = (expected - camera.centre_px) * (FOCAL_UNIT * problem.camera.focal_px / camera.focal_px)
     shared[:, :, FAULT] = _by(by_focal, white)
     if problem.free[LENS:].any():
-        shared[:, :, LENS:] = white @ (camera.parameter_slope(direction, expected) @ problem.lens_root)
+        shared[:, :, LENS:] = white @ (camera.parameter_jacobian(direction, expected) @ problem.lens_root)
     rows[:, :, -1] = miss * np.sqrt(weight)[:, None]
     angles, angles_miss = _attitude(problem, at.rotation)
     cost += float(at.lens @ at.lens + at.local.ravel() @ at.local.ravel() + angles_miss @ angles_miss)

@@ -264,7 +264,7 @@ def gnss_fix(
         turned = np.cross(np.diag([level, level, upright]), arm)
         spread = spread + turned.T @ turned
     latitude, longitude, height = (float(v) for v in here.to_geodetic(-arm))
-    turn = axes.turn_from(here)
+    turn = axes.rotation_from(here)
     spread = turn @ spread @ turn.T
     unknown = math.nan
     return Fix(

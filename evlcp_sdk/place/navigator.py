@@ -73,7 +73,7 @@ def estimate_biases(
     found: list[EstimatedBias] = []
     for part, (mean, covariance) in states.items():
         if part == "camera":
-            root = camera_sigma.root(camera)
+            root = camera_sigma.covariance_root(camera)
             root[0] *= camera.focal_mm / camera.focal_px
             names: tuple[str, ...] = CAMERA_PARAMETERS
         elif part == "attitude" and attitude is not None:
@@ -87,7 +87,7 @@ def estimate_biases(
         elif part.startswith("bar ") and len(mean) > 1 and (site := sites.get(int(part[4:]))) is not None:
             # After its length come its place and its turn.
             mean, covariance = mean[1:4], covariance[1:4, 1:4]
-            root = site.survey[0] * np.eye(3)
+            root = site.survey_sigmas[0] * np.eye(3)
             names = ("east_m", "north_m", "up_m")
         else:
             continue
@@ -106,7 +106,7 @@ def focal_share(
     """By what share the focal length is longer than stated, and its sigma; NaN if it was stated exactly."""
     if state is None or not camera_sigma.focal_mm > 0:
         return math.nan, math.nan
-    row = camera_sigma.root(camera)[0] / camera.focal_px
+    row = camera_sigma.covariance_root(camera)[0] / camera.focal_px
     return float(row @ state[0]), math.sqrt(max(float(row @ state[1] @ row), 0.0))
 
 
@@ -237,7 +237,7 @@ class Navigator:
             link.camera_sigma,
         )
         self._log = attitude if isinstance(attitude, AttitudeLog) else None
-        self._imu = None if self._log is None else self._log.between
+        self._imu = None if self._log is None else self._log.motion_between
         self._attitude_at = attitude_source(attitude)
         self._gnss, self._gnss_next = plan.gnss, 0
         self._span: tuple[float, float] | None = None
@@ -298,7 +298,9 @@ class Navigator:
             if self._span is None:
                 self._span = (fix.t_us, fix.t_us)
             placed += self._satellites(fix.t_us)
-            self._counts["attitude_missing"] += self._log is not None and self._log.at(fix.t_us) is None
+            self._counts["attitude_missing"] += (
+                self._log is not None and self._log.interpolate(fix.t_us) is None
+            )
             placed.append(self._filter(fix))
         return placed
 

@@ -121,7 +121,7 @@ def project_bars(
     offset = enu_m - position_m
     seen = offset @ rotation
     ahead = np.where(seen[:, 2:] > 0, seen, np.nan)
-    slope = camera.project_slope(ahead) @ rotation.T
+    slope = camera.projection_jacobian(ahead) @ rotation.T
     turned = np.cross(slope, offset[:, None, :])
     return camera.project(ahead), np.concatenate([-slope, turned], -1)
 
@@ -188,7 +188,7 @@ class KnownAngles(NamedTuple):
         unsure = (attitude.gravity_sigma_deg, attitude.white_sigma_deg, attitude.time_sigma_us)
         if not any((shaken_rad, *unsure)):
             turns = (False, False, not compass or attitude.heading_sigma_deg > 0)
-        causes, known = attitude.standing(), 3 if compass else 2
+        causes, known = attitude.bias_root_rad(), 3 if compass else 2
         # All err anew with each time, too: as the attitude's own noise does, and what shifts an image down or
         # aside, as a camera turns about its own axes across and upright: the second is not the world's.
         pitch = math.radians(attitude.pitch_deg)
@@ -287,7 +287,7 @@ class Problem:
             bar=np.repeat(np.arange(len(parts)), [len(part) for part in parts]),
             errors=SharedErrors(*map(np.array, zip(*errors, strict=True))),
             transmitters=tuple(kept),
-            lens_root=sigma.root(camera),
+            lens_root=sigma.covariance_root(camera),
             shaken_rad=between * spec.shaken_sigma_px / camera.focal_px,
         )
         return problem._determined()
@@ -320,7 +320,7 @@ class Problem:
 
     def seen_by(self, sigma: CameraSigma) -> "Problem":
         """The same through a camera that is so surely known."""
-        return replace(self, lens_root=sigma.root(self.camera))
+        return replace(self, lens_root=sigma.covariance_root(self.camera))
 
     def _determined(self) -> "Problem | Rejection":
         """The same, or why its attitude is too little for its bars."""

@@ -261,13 +261,13 @@ def bar_point(
             math.hypot(spec.shared_along_px, grown),
         ),
     )
-    inverse = depth * np.linalg.inv(camera.distort_slope(sight))
+    inverse = depth * np.linalg.inv(camera.distortion_jacobian(sight))
     standing = np.zeros((3, 8))
-    if sigma.known:
-        standing[:2, :7] = -inverse @ camera.parameter_slope(sight)
+    if sigma.is_known:
+        standing[:2, :7] = -inverse @ camera.parameter_jacobian(sight)
         # A bar of so many pixels is the farther, the longer the lens.
         standing[:, 0] += along * depth / camera.focal_px
-        standing[:, :7] = standing[:, :7] @ sigma.root(camera)
+        standing[:, :7] = standing[:, :7] @ sigma.covariance_root(camera)
     standing[:, 7] = along * math.hypot(depth * spec.stretch_share, frame.range.standing_m)
     new = np.zeros((3, 3))
     new[:, 0] = along * math.sqrt(max(frame.range.sigma_m**2 - frame.range.standing_m**2, 0.0))

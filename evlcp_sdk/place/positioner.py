@@ -167,7 +167,7 @@ class Positioner:
             self.axes = self.axes or here
             try:
                 enu = site.layout_positions_m(kind.bar, here)
-                sited.append(replace(view, enu_m=enu, survey=site.survey))
+                sited.append(replace(view, enu_m=enu, survey=site.survey_sigmas))
             except ConfigError as fault:
                 unplaced.append(str(fault))
         if not views:
@@ -195,7 +195,7 @@ class Positioner:
             refused = Fix.from_refusal(t_us, tuple(views), pose.kind, pose.detail)
             others = _alternatives(pose, here, axes)
             return replace(refused, alternatives=others, suspects=pose.suspects)
-        turn = axes.turn_from(here)
+        turn = axes.rotation_from(here)
         failed = pose.failed
         if failed is not None:
             spread = turn @ failed.covariance_m2 @ turn.T
@@ -240,7 +240,7 @@ def _on_earth(enu_m: Floats, rotation: Floats, here: LocalAxes, axes: LocalAxes)
 
 def _alternatives(refusal: Rejection, here: LocalAxes, axes: LocalAxes) -> tuple[Alternative, ...]:
     """The poses that a refusal leaves open, on earth."""
-    turn = axes.turn_from(here)
+    turn = axes.rotation_from(here)
     return tuple(
         Alternative(
             **_on_earth(one.enu_m, one.rotation, here, axes),

@@ -171,7 +171,7 @@ def survey(
         if not placed:
             raise ConfigError("no view shows a bar: nothing to survey")
         common = (max(v.place_sigma_m for v in placed), max(v.turn_sigma_rad for v in placed))
-        solved = solve_views(placed, camera, sigma.root(camera), common)
+        solved = solve_views(placed, camera, sigma.covariance_root(camera), common)
         turned = 0.0
         for number, at in solved.bars.items():
             centre, axis = started[number]
@@ -194,7 +194,7 @@ def survey(
         # A turn about its own axis moves nothing.
         across = _TURN_RAD * np.cross(np.eye(3), axis)
         place = LocalAxes(*(float(v) for v in axes.to_geodetic(centre)))
-        east, north, up = place.turn_from(axes) @ axis
+        east, north, up = place.rotation_from(axes) @ axis
         covariance = _PLACE_M**2 * spread[:3, :3]
         leans = across.T @ spread[3:6, 3:6] @ across
         site = BarSite(

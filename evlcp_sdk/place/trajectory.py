@@ -46,8 +46,8 @@ class Reckoned:
 
 def imu_sigmas(motion: ImuMotion, spec: ErrorModel) -> Floats:
     """Sigmas of an IMU's biases: the gyroscope's, radians/s, the accelerometer's, m/s2: none, 1 or 4."""
-    sigmas = [np.radians(spec.rate_sigma_deg_s)] if motion.gyro else []
-    if motion.push_m_s2 is not None:
+    sigmas = [np.radians(spec.rate_sigma_deg_s)] if motion.has_gyro else []
+    if motion.acceleration_m_s2 is not None:
         sigmas += 3 * [spec.push_sigma_m_s2]
     return np.array(sigmas)
 
@@ -73,11 +73,11 @@ def reckon(
     s, weight = _nodes(motion.t_s)
     span = float(s[-1])
     angle = np.interp(s, motion.t_s, motion.turn_rad)
-    if motion.gyro:
+    if motion.has_gyro:
         angle = angle - bias[0] * s
     turned, way = np.exp(-1j * angle), _integral_of_turn(s, angle)
     pushed = None
-    if motion.push_m_s2 is None:
+    if motion.acceleration_m_s2 is None:
         ahead = complex(velocity_m_s[0], velocity_m_s[1])
         rest = way[-1] - way
         by_angle = -1j * ahead * np.stack([rest, np.full_like(rest, turned[-1])])
@@ -86,7 +86,7 @@ def reckon(
         move_to = complex(way[-1]), complex(turned[-1])
         added = np.zeros(6)
     else:
-        pushed = motion.push_m_s2 - bias[-3:]
+        pushed = motion.acceleration_m_s2 - bias[-3:]
         level = np.interp(s, motion.t_s, pushed[:, 0]) + 1j * np.interp(s, motion.t_s, pushed[:, 1])
         facing = np.exp(-1j * heading_rad)
         speed = _running(s, facing * turned * level)
@@ -108,7 +108,7 @@ def reckon(
     flat = np.stack([by_angle[0].real, by_angle[0].imag, by_angle[1].real, by_angle[1].imag])
     level_rows = [0, 1, 3, 4]
     by_imu = np.zeros((6, len(sigmas)))
-    if motion.gyro:
+    if motion.has_gyro:
         drift = np.radians(spec.rate_white_deg_rts) ** 2
         noise[np.ix_(level_rows, level_rows)] += drift * (flat * weight) @ flat.T
         by_imu[level_rows, 0] = -(flat @ weight) * sigmas[0]
@@ -311,7 +311,7 @@ def trajectory_step(
         turn = math.remainder(fix.heading_deg - state.heading_deg, 360.0)
         recent = fix.t_us - state.heading_t_us <= _TURN_US
         turn_rad = math.radians(turn) if recent and math.isfinite(turn) else 0.0
-        motion = ImuMotion.even((fix.t_us - state.t_us) * 1e-6, turn_rad)
+        motion = ImuMotion.from_uniform_turn((fix.t_us - state.t_us) * 1e-6, turn_rad)
     ahead, seen = _expected(_joined(_ahead(state, fix.t_us, motion, spec), fix), fix)
     innovation = fix.enu_m - seen @ ahead.mean
     spread = seen @ ahead.covariance @ seen.T + fix.noise_m2
@@ -541,7 +541,7 @@ def _ahead(point: TrajectoryPoint, t_us: float, motion: ImuMotion, spec: ErrorMo
     ahead = replace(
         point, t_us=t_us, mean=mean, covariance=covariance, causes=causes, motion=motion, starts=False
     )
-    if not motion.gyro:
+    if not motion.has_gyro:
         return ahead
     drift_deg = spec.rate_white_deg_rts * math.sqrt(float(motion.t_s[-1]))
     return replace(
@@ -575,9 +575,9 @@ def _motion(
     move = np.eye(len(point.mean))[rows]
     noise = np.zeros((len(rows), len(rows)))
     own = next((at for c, at in _columns(point.causes) if c.name == IMU), slice(0, 0))
-    if motion.push_m_s2 is not None and not math.isfinite(point.heading_deg):
+    if motion.acceleration_m_s2 is not None and not math.isfinite(point.heading_deg):
         # Where a push points to is not known without a heading.
-        motion = replace(motion, push_m_s2=None)
+        motion = replace(motion, acceleration_m_s2=None)
     imu = point.mean[own][: len(imu_sigmas(motion, spec))]
     heading_rad, sigma_rad = math.radians(point.heading_deg), math.radians(point.heading_sigma_deg)
     way = reckon(motion, point.mean[3:_MOTION], heading_rad, sigma_rad, imu, spec)

@@ -392,14 +392,14 @@ _WIDEST = 2.0
 
 def _ranging_of(bar: BarLayout, of_chips: Collection[str]) -> str:
     """Id of the ranging that fits a layout best."""
-    if not bar.apart:
+    if not bar.has_distinct_centres:
         return "none"
     # From side to side `joint-scale` measures nothing: of low columns far apart, that is what counts.
     high_m = max((len(clusters) * pitch_m for clusters, pitch_m in bar.even_columns), default=0.0)
     if "pilots" not in of_chips and high_m > 0 and bar.width_m <= _WIDEST * high_m:
         return "joint-scale"
-    alike_sides = int(bar.alike_sides.sum())
-    if alike_sides >= 2 and bar.alike:
+    alike_sides = int(bar.has_usual_sides.sum())
+    if alike_sides >= 2 and bar.has_equal_clusters:
         return "poc"
     return "centroid" if alike_sides >= 3 else "none"
 

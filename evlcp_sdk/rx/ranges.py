@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.straight import ALIKE, STRAIGHT, WAVE_PX, Image, judge_image
-from evlcp_sdk.scene.lean import BarSight
+from evlcp_sdk.scene.tilt import LineOfSight
 from evlcp_sdk.values import Curvature, Range
 
 _MEMORY_S = 0.3
@@ -104,7 +104,7 @@ class RangeKeeper:
         self._likely = self._mixture(_LEVEL_DEG, _LEANING_SHARE)
 
     def step(
-        self, state: Ranges, t_us: float, chip_us: float, measured: Range, sight: BarSight
+        self, state: Ranges, t_us: float, chip_us: float, measured: Range, sight: LineOfSight
     ) -> tuple[Ranges, Range]:
         """Take a frame's distance; give the new state and the distance as it should be.
 
@@ -126,9 +126,9 @@ class RangeKeeper:
         height, unsure_m, off = (0.0, WAVE_PX**2), 0.0, state.off
         if measured.curvature is not None:
             faded = math.exp(-max(t_s - bend_s, 0.0) / _TILT_MEMORY_S) if bend.size else 0.0
-            new = _weighed(measured.curvature, (sight.sine or 0.0) + sight.bow)
-            goes_on = bend.shape == new.shape and told == (sight.sine is not None)
-            bend, bend_s, told = new + faded * bend if goes_on else new, t_s, sight.sine is not None
+            new = _weighed(measured.curvature, (sight.tilt_sine or 0.0) + sight.distortion_tilt)
+            goes_on = bend.shape == new.shape and told == (sight.tilt_sine is not None)
+            bend, bend_s, told = new + faded * bend if goes_on else new, t_s, sight.tilt_sine is not None
             wave, off, known = wave * faded, np.empty(new.shape[1]), (bend, state.off)
             scatter = _kernels.add_phase_bias(measured.curvature.place, new, _LEAST_WEIGHT, wave, known, off)
             sums = wave.tolist()
@@ -173,14 +173,14 @@ class RangeKeeper:
         return Ranges(past, bend, bend_s, told, wave, image, off), found
 
     def _leaning(
-        self, sums: Floats, wave: tuple[float, float], newest: Curvature | None, sight: BarSight
+        self, sums: Floats, wave: tuple[float, float], newest: Curvature | None, sight: LineOfSight
     ) -> tuple[float, float]:
         """Mean and variance of the foreshortening, by what is likely and by what was seen."""
         likely, sine, told = self._likely, self._sine, 0.0
-        if sight.sine is not None:
-            told = sight.sine
+        if sight.tilt_sine is not None:
+            told = sight.tilt_sine
             sine = np.sin(math.asin(told) + np.radians(self._lean_deg))
-            sigma_deg = math.degrees(sight.sigma / math.sqrt(max(1 - told**2, sight.sigma**2)))
+            sigma_deg = math.degrees(sight.tilt_sigma / math.sqrt(max(1 - told**2, sight.tilt_sigma**2)))
             likely = self._mixture(sigma_deg, _SLANTED_SHARE)
         off, sigma = math.nan, 1.0
         if newest is not None:

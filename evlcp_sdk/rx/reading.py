@@ -21,7 +21,7 @@ from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
 from evlcp_sdk.rx.regions import MARGIN_PX, Followed, ShownPlace
 from evlcp_sdk.rx.spread import LateSpread, Spread, neighbours
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.lean import BarSight, magnification_of, sight_of
+from evlcp_sdk.scene.tilt import LineOfSight, line_of_sight, magnification_of
 from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
 
 _FRAME_WORTH = 6.0
@@ -54,7 +54,7 @@ _SURE = 0.98
 """Quality of a frame from which on its symbols hold, whatever the light of all does: where they are wrong, it
 is less. A halo and a jolt look like a step of light now and then."""
 
-_NO_RANGE, _NO_SIGHT = Range(math.nan, math.nan, 0), BarSight()
+_NO_RANGE, _NO_SIGHT = Range(math.nan, math.nan, 0), LineOfSight()
 
 _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
 
@@ -124,7 +124,7 @@ class Steps:
         return distance
 
     def follow(
-        self, state: tuple[Ranges, Any], t_us: float, chip_us: float, measured: Range, sight: BarSight
+        self, state: tuple[Ranges, Any], t_us: float, chip_us: float, measured: Range, sight: LineOfSight
     ) -> tuple[tuple[Ranges, Any], Range, Range | None]:
         """Take a frame's distance as the ranging gave it; the new state, the distance, and that filtered.
 
@@ -173,7 +173,7 @@ class Reading(NamedTuple):
     sigma_px: NDArray[np.float64]
     flank_px: float
     centre_px: tuple[float, float]
-    sight: BarSight
+    sight: LineOfSight
     spread: Callable[[], Spread] | None
     flooded: bool
 
@@ -299,9 +299,9 @@ class FrameReader:
         )
         sight = _NO_SIGHT
         if self._is_column:
-            sight = sight_of(self._camera, points_px, sigma_px, attitude)
+            sight = line_of_sight(self._camera, points_px, sigma_px, attitude)
         elif not self._camera.is_pinhole:
-            sight = BarSight(magnification=magnification_of(self._camera, points_px))
+            sight = LineOfSight(magnification=magnification_of(self._camera, points_px))
         # Only of two images at one time it is asked; the pilot alone is kept for that, not the whole frame.
         spread = LateSpread(heard.copy(), self._pilots, self._every, self._layout, self._pairs, placement)
         image = points_px, sigma_px, flank_px, centre_px

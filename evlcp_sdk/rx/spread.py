@@ -263,7 +263,7 @@ def expected_lengths(spacing_px: float, blurs_px: Floats, backgrounds: Sequence[
     Returns:
         float64 (blurs * backgrounds, 3).
     """
-    from evlcp_sdk.scene.optics import airy_blur, step
+    from evlcp_sdk.scene.optics import airy_blur, blurred_edge
 
     half = _STRIP * spacing_px / 2
     along, across = np.linspace(-spacing_px / 2, spacing_px / 2, 201), np.linspace(0, _ACROSS_PX, 401)
@@ -271,12 +271,12 @@ def expected_lengths(spacing_px: float, blurs_px: Floats, backgrounds: Sequence[
     for blur_px in blurs_px:
         blur = airy_blur(_UNIT_PX, math.hypot(_REST_PX, blur_px))
         sigma, share = blur.sigma_px[:, None], blur.share[:, None]
-        strip = share * (step(across + half, sigma) - step(across - half, sigma))
+        strip = share * (blurred_edge(across + half, sigma) - blurred_edge(across - half, sigma))
         line = strip.sum(0) / strip.sum(0)[0]
         core = (
             strip[:, across <= _AXIS_PX].mean(1, keepdims=True) / strip[:, across <= _AXIS_PX].mean(1).sum()
         )
-        own = (core * (step(along, sigma) - step(along - spacing_px, sigma))).sum(0)
+        own = (core * (blurred_edge(along, sigma) - blurred_edge(along - spacing_px, sigma))).sum(0)
         for background in backgrounds:
             threshold = _RATIO * background
             lengths.append(

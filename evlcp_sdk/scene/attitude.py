@@ -19,48 +19,48 @@ _FORCES = tuple(f"force_{axis}_m_s2" for axis in _AXES)
 _GRAVITY_M_S2 = 9.80665
 """On earth it is within 0.03 of this, less than an accelerometer's bias."""
 
-_MOST_MEASURED = 1e5
-"""Rate, degrees/s, or force, m/s2, of more than any sensor's."""
+_LARGEST_READING = 1e5
+"""A rate, degrees/s, or force, m/s2, above any sensor's range."""
 
 _NEEDED = {"t_us": ANY_NUMBER, "pitch_deg": (-90.0, 90.0), "roll_deg": ANY_NUMBER}
 _OPTIONAL = {
     "heading_deg": ANY_NUMBER,
     **dict.fromkeys(("gravity_sigma_deg", "heading_sigma_deg"), (0.0, math.inf)),
-    **dict.fromkeys(_RATES + _FORCES, (-_MOST_MEASURED, _MOST_MEASURED)),
+    **dict.fromkeys(_RATES + _FORCES, (-_LARGEST_READING, _LARGEST_READING)),
 }
-"""Columns, and between what their values are."""
+"""Columns, and the range of their values."""
 
-_GAP = 10.0
-"""How many times as long as usual (the median) two lines lie apart where lines between them are lost: clocks
-and buffers that jitter make it two or three."""
+_GAP_INTERVALS = 10.0
+"""Time between two lines, in median intervals, above which lines are lost; jitter of clocks and buffers makes
+it two or three."""
 
-_PIECES = 32
-"""Of a log, whose turns by headings and by rates are compared: of so many that have nothing to do with one
-another, less than 1 in 100 000 agree by half (r2)."""
+_COMPARED_PIECES = 32
+"""Pieces of a log in which turns by headings and by rates are compared: of so many unrelated ones, less than
+1 in 100 000 agree by half (r2)."""
 
-_DRIFT_DEG_S = 5.0
-"""Rate that no gyroscope which is of use for a track has at rest."""
+_LARGEST_DRIFT_DEG_S = 5.0
+"""Rate at rest above that of any gyroscope that is of use for a track."""
 
 _MOST_KNOTS = 4096
-"""Lines of a log that one step of a track goes by; of more, every second, third ... counts."""
+"""Lines of a log that one step of a track uses; of more, every second, third ... counts."""
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """How the camera is turned, and how certain that is: a compass and gravity.
+    """The camera's pitch, roll and heading, and their errors: from gravity and a compass.
 
-    From looking level to the north it is first turned to the right, then up, then rolled.
+    From looking level to the north the camera is first turned to the right, then up, then rolled.
 
     Attributes:
         pitch_deg: How far the optical axis points above the horizon.
         roll_deg: How far the camera's top leans to its right.
         heading_deg: Where the optical axis points to, clockwise from north; None when unknown.
-        gravity_sigma_deg: Standard deviation of what stays wrong with pitch and roll each; 0: exact.
-        heading_sigma_deg: The same of the heading; 0: exact.
-        white_sigma_deg: Of what is new with every time, of each angle.
-        time_sigma_us: Of the offset of its clock from the camera's, us.
-        rate_deg_s: How fast pitch, roll and heading change, degrees / s: what an offset in time moves them
-            by.
+        gravity_sigma_deg: Standard deviation of the bias of pitch and of roll; 0: exact.
+        heading_sigma_deg: Standard deviation of the heading's bias; 0: exact.
+        white_sigma_deg: Standard deviation of each angle's error that is independent at every time.
+        time_sigma_us: Standard deviation of the clock's offset from the camera's, us.
+        rate_deg_s: Rates of change of pitch, roll and heading, degrees / s, by which an offset in time
+            shifts them.
 
     >>> Attitude(heading_deg=90.0).rotation()[:, 2].round(6).tolist()
     [1.0, 0.0, 0.0]
@@ -75,10 +75,10 @@ class Attitude:
     time_sigma_us: float = 0.0
     rate_deg_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def standing(self) -> NDArray[np.float64]:
-        """What stays wrong with pitch, roll and heading, radians: float64 (3, 4), one column a cause.
+    def bias_root_rad(self) -> NDArray[np.float64]:
+        """Shifts of pitch, roll and heading by one sigma of each persistent error, float64 (3, 4).
 
-        The causes are the bias of each, and the offset in time; all in their own sigmas.
+        The columns are the biases of the three, and the offset in time.
         """
         tilt, turn = math.radians(self.gravity_sigma_deg), math.radians(self.heading_sigma_deg)
         pitch, roll, heading = (math.radians(v) * self.time_sigma_us * 1e-6 for v in self.rate_deg_s)
@@ -109,46 +109,46 @@ class Attitude:
 
 @dataclass(frozen=True, eq=False)
 class ImuMotion:
-    """Turn and push of a camera at times between two, straight lines between these.
+    """Turn and acceleration of a camera from one time to another, linear between samples.
 
     Attributes:
-        t_s: Since the first time, s, rising from 0 to the last, float64 (k,), k >= 2.
-        turn_rad: By how much the heading has changed since the first time, clockwise, radians, float64 (k,).
-        gyro: The turn is that of a gyroscope, which has a bias and a noise that grows.
-        push_m_s2: Acceleration without gravity, to the camera's right, forward, both level, and up, m/s2,
-            float64 (k, 3); None without an accelerometer.
+        t_s: Times of the samples since the first, s, rising, float64 (k,), k >= 2.
+        turn_rad: Clockwise change of the heading since the first time, radians, float64 (k,).
+        has_gyro: Whether a gyroscope measured the turn, with a bias and a noise that grows.
+        acceleration_m_s2: Acceleration without gravity, to the camera's right, forward, both level, and up,
+            m/s2, float64 (k, 3); None without an accelerometer.
     """
 
     t_s: NDArray[np.float64]
     turn_rad: NDArray[np.float64]
-    gyro: bool = False
-    push_m_s2: NDArray[np.float64] | None = None
+    has_gyro: bool = False
+    acceleration_m_s2: NDArray[np.float64] | None = None
 
     @classmethod
-    def even(cls, dt_s: float, turn_rad: float) -> "ImuMotion":
-        """A turn at one rate."""
+    def from_uniform_turn(cls, dt_s: float, turn_rad: float) -> "ImuMotion":
+        """A turn at a constant rate."""
         return cls(np.array([0.0, dt_s]), np.array([0.0, turn_rad]))
 
 
 @dataclass(frozen=True, eq=False)
 class AttitudeLog:
-    """Attitudes at rising times, straight between them, nothing before, after, and where lines are lost.
+    """Attitudes at rising times, linear between them; unknown before, after, and where lines are lost.
 
-    Lines are lost where two lie ten times as far apart as they do usually (the median).
+    Lines are lost between two that are more than ten median intervals apart.
 
     Attributes:
         t_us: Camera clock, us, float64 (n,), rising.
         pitch_deg: float64 (n,).
         roll_deg: float64 (n,).
-        heading_deg: float64 (n,); None where the heading is not known.
+        heading_deg: float64 (n,); None if the heading is unknown.
         gravity_sigma_deg: float64 (n,).
         heading_sigma_deg: float64 (n,).
-        white_sigma_deg: As an `Attitude` has it.
-        time_sigma_us: The same.
-        rates_deg_s: What a gyroscope measures about the camera's axes right, down and forward, float64
-            (n, 3); None where there is none. A turn to the right is positive about down.
-        forces_m_s2: What an accelerometer measures along the same axes, float64 (n, 3): at rest and level
-            -9.8 down; None where there is none.
+        white_sigma_deg: As in `Attitude`.
+        time_sigma_us: As in `Attitude`.
+        rates_deg_s: A gyroscope's rates about the camera's axes right, down and forward, float64 (n, 3);
+            None without one. A turn to the right is positive about down.
+        forces_m_s2: An accelerometer's forces along the same axes, float64 (n, 3), at rest and level -9.8
+            down; None without one.
     """
 
     t_us: NDArray[np.float64]
@@ -163,21 +163,20 @@ class AttitudeLog:
     forces_m_s2: NDArray[np.float64] | None = None
 
     @classmethod
-    def read(cls, path: Path | str, usual: Attitude | None = None) -> "AttitudeLog":
+    def read(cls, path: Path | str, default: Attitude | None = None) -> "AttitudeLog":
         """Read a CSV of t_us, pitch_deg, roll_deg; optionally heading_deg, both sigmas, rates and forces.
 
         Args:
             path: The file.
-            usual: Its sigmas count where the file has none; None for the defaults.
+            default: Gives the sigmas that the file lacks; None for an `Attitude` of defaults.
 
         Raises:
             InputError: The file cannot be read.
-            ConfigError: A column is missing, a value is not a number, or times do not rise; of rates or
-                forces one axis is there and another is not, or there are forces and no rates, or they are
-                half as much from gravity as gravity is, or more, or rates turn the other way than headings
-                do, or by another measure.
+            ConfigError: A column is missing, a value is not a number, or times do not rise; rates or forces
+                lack an axis; there are forces without rates; the mean upward force differs from gravity by
+                half or more; or rates and headings turn in opposite directions or at different scales.
         """
-        usual = Attitude() if usual is None else usual
+        default = Attitude() if default is None else default
         _, table = read_table(path, _NEEDED, _OPTIONAL, rising="t_us")
         for axes in (_RATES, _FORCES):
             absent = [name for name in axes if name not in table]
@@ -193,50 +192,50 @@ class AttitudeLog:
             table["pitch_deg"],
             np.degrees(np.unwrap(np.radians(table["roll_deg"]))),
             np.degrees(np.unwrap(np.radians(table["heading_deg"]))) if "heading_deg" in table else None,
-            table.get("gravity_sigma_deg", np.full(len(t_us), usual.gravity_sigma_deg)),
-            table.get("heading_sigma_deg", np.full(len(t_us), usual.heading_sigma_deg)),
-            usual.white_sigma_deg,
-            usual.time_sigma_us,
+            table.get("gravity_sigma_deg", np.full(len(t_us), default.gravity_sigma_deg)),
+            table.get("heading_sigma_deg", np.full(len(t_us), default.heading_sigma_deg)),
+            default.white_sigma_deg,
+            default.time_sigma_us,
             *(np.stack([table[n] for n in a], 1) if a[0] in table else None for a in (_RATES, _FORCES)),
         )
-        log._check_senses(path)
+        log._check_conventions(path)
         return log
 
-    def _check_senses(self, path: Path | str) -> None:
-        """Refuse forces and rates that are of other signs or measures than they should be."""
-        if self._push_m_s2 is not None:
-            upward = float(self._push_m_s2[:, 2].mean()) + _GRAVITY_M_S2
+    def _check_conventions(self, path: Path | str) -> None:
+        """Raise ConfigError if forces or rates have the wrong sign or scale."""
+        if self._acceleration_m_s2 is not None:
+            upward = float(self._acceleration_m_s2[:, 2].mean()) + _GRAVITY_M_S2
             if not 0.5 * _GRAVITY_M_S2 < upward < 1.5 * _GRAVITY_M_S2:
                 raise ConfigError(
                     f"{path}: forces hold the camera up by {upward:.1f} m/s2 on the mean, expected about 9.8:"
                     " a level camera at rest has force_down_m_s2 = -9.8"
                 )
-        times = self._times_turned()
-        if times is not None and not 0.5 < times < 1.5:
+        scale = self._rate_scale()
+        if scale is not None and not 0.5 < scale < 1.5:
             raise ConfigError(
-                f"{path}: rates turn the camera {times:.3g} times as far as its headings do, expected 1:"
+                f"{path}: rates turn the camera {scale:.3g} times as far as its headings do, expected 1:"
                 " a turn to the right is positive about down, in degrees/s"
             )
 
-    def _times_turned(self) -> float | None:
-        """How many times as far as by headings the camera turns by rates; None where nothing says so.
+    def _rate_scale(self) -> float | None:
+        """The turn by rates as a multiple of that by headings; None if the log does not determine it.
 
-        Noise of headings makes it less than 1, but not less than by what share both agree (r2).
+        Noise of the headings makes it less than 1, but not less than their agreement (r2).
         """
-        turned = self._turned_rad
-        if self.heading_deg is None or self.rates_deg_s is None or turned is None:
+        turn_rad = self._heading_change_rad
+        if self.heading_deg is None or self.rates_deg_s is None or turn_rad is None:
             return None
-        ends = np.linspace(self.t_us[0], self.t_us[-1], _PIECES + 1)
-        took_s = (ends[1] - ends[0]) * 1e-6
-        logged = np.diff(np.interp(ends, self.t_us, self.heading_deg)) / took_s
-        measured = np.degrees(np.diff(np.interp(ends, self.t_us, turned))) / took_s
+        ends_us = np.linspace(self.t_us[0], self.t_us[-1], _COMPARED_PIECES + 1)
+        piece_s = (ends_us[1] - ends_us[0]) * 1e-6
+        logged = np.diff(np.interp(ends_us, self.t_us, self.heading_deg)) / piece_s
+        measured = np.degrees(np.diff(np.interp(ends_us, self.t_us, turn_rad))) / piece_s
         both, own = float(logged @ measured), float(logged @ logged)
-        if np.sqrt(((measured - logged) ** 2).mean()) < _DRIFT_DEG_S:
+        if np.sqrt(((measured - logged) ** 2).mean()) < _LARGEST_DRIFT_DEG_S:
             return None
         return both / own if both**2 > 0.5 * own * float(measured @ measured) else None
 
     def to_csv(self) -> str:
-        """The text of a file that `read` takes."""
+        """The log as the text of a CSV file for `read`."""
         columns = {
             "t_us": [f"{v:.0f}" for v in self.t_us],
             "pitch_deg": [f"{v:.5f}" for v in self.pitch_deg],
@@ -252,12 +251,12 @@ class AttitudeLog:
         lines = [",".join(columns), *(",".join(row) for row in zip(*columns.values(), strict=True))]
         return "\n".join(lines) + "\n"
 
-    def at(self, t_us: float) -> Attitude | None:
-        """The attitude at a time; None outside of the track, and where lines are lost."""
+    def interpolate(self, t_us: float) -> Attitude | None:
+        """The attitude at a time, linear between lines; None outside the log and where lines are lost."""
         if not self.t_us[0] <= t_us <= self.t_us[-1]:
             return None
         before, after = (int(np.searchsorted(self.t_us, t_us, side)) for side in ("left", "right"))
-        if before == after and self._is_lost(before - 1, after):
+        if before == after and self._has_gap(before - 1, after):
             return None
 
         def value(column: NDArray[np.float64]) -> float:
@@ -274,46 +273,46 @@ class AttitudeLog:
             self._rate_deg_s(t_us),
         )
 
-    def between(self, start_us: float, end_us: float) -> ImuMotion | None:
-        """How the camera turned, and was pushed, from one time to a later one; None where that is not known.
+    def motion_between(self, start_us: float, end_us: float) -> ImuMotion | None:
+        """The camera's turn and acceleration from one time to a later one; None if they are not known.
 
-        By the rates where there are any, else by the headings.
+        The turn is by the rates if the log has any, else by the headings.
         """
-        turned = self._turned_rad
-        if turned is None or not self.t_us[0] <= start_us < end_us <= self.t_us[-1]:
+        turn_rad = self._heading_change_rad
+        if turn_rad is None or not self.t_us[0] <= start_us < end_us <= self.t_us[-1]:
             return None
         first, last = np.searchsorted(self.t_us, (start_us, end_us), "right").tolist()
-        if self._is_lost(first - 1, int(np.searchsorted(self.t_us, end_us))):
+        if self._has_gap(first - 1, int(np.searchsorted(self.t_us, end_us))):
             return None
         inner = self.t_us[first:last]
         inner = inner[inner < end_us][:: 1 + len(inner) // _MOST_KNOTS]
         t_us = np.concatenate([[start_us], inner, [end_us]])
-        angle = np.interp(t_us, self.t_us, turned)
-        push = self._push_m_s2
-        if push is not None:
-            push = np.stack([np.interp(t_us, self.t_us, column) for column in push.T], 1)
-        return ImuMotion((t_us - start_us) * 1e-6, angle - angle[0], self.rates_deg_s is not None, push)
+        angle = np.interp(t_us, self.t_us, turn_rad)
+        acceleration = self._acceleration_m_s2
+        if acceleration is not None:
+            acceleration = np.stack([np.interp(t_us, self.t_us, column) for column in acceleration.T], 1)
+        has_gyro = self.rates_deg_s is not None
+        return ImuMotion((t_us - start_us) * 1e-6, angle - angle[0], has_gyro, acceleration)
 
-    def _is_lost(self, first: int, last: int) -> bool:
-        """Whether lines are lost anywhere from one line to another."""
-        return bool((np.diff(self.t_us[first : last + 1]) > self._longest_us).any())
-
-    @cached_property
-    def _longest_us(self) -> float:
-        return _GAP * float(np.median(np.diff(self.t_us)))
+    def _has_gap(self, first: int, last: int) -> bool:
+        return bool((np.diff(self.t_us[first : last + 1]) > self._longest_interval_us).any())
 
     @cached_property
-    def _turned_rad(self) -> NDArray[np.float64] | None:
-        """The heading's change since the first line."""
+    def _longest_interval_us(self) -> float:
+        return _GAP_INTERVALS * float(np.median(np.diff(self.t_us)))
+
+    @cached_property
+    def _heading_change_rad(self) -> NDArray[np.float64] | None:
+        """The heading's change since the first line, by rates if there are any, float64 (n,)."""
         if self.rates_deg_s is None:
             return None if self.heading_deg is None else np.radians(self.heading_deg - self.heading_deg[0])
-        rate = -(self.rates_deg_s * self._up()).sum(1)
+        rate = -(self.rates_deg_s * self._up_axis()).sum(1)
         steps = np.diff(self.t_us) * (rate[1:] + rate[:-1]) / 2
         return np.radians(np.concatenate([[0.0], np.cumsum(steps)]) * 1e-6)
 
     @cached_property
-    def _push_m_s2(self) -> NDArray[np.float64] | None:
-        """Acceleration without gravity to the right, forward and up, level."""
+    def _acceleration_m_s2(self) -> NDArray[np.float64] | None:
+        """Acceleration without gravity to the right, forward and up, both level, float64 (n, 3)."""
         if self.forces_m_s2 is None:
             return None
         right, down, forward = self.forces_m_s2.T
@@ -323,19 +322,19 @@ class AttitudeLog:
             [
                 right * np.cos(roll) - down * np.sin(roll),
                 below * np.sin(pitch) + forward * np.cos(pitch),
-                (self.forces_m_s2 * self._up()).sum(1) - _GRAVITY_M_S2,
+                (self.forces_m_s2 * self._up_axis()).sum(1) - _GRAVITY_M_S2,
             ],
             1,
         )
 
-    def _up(self) -> NDArray[np.float64]:
-        """Up in the camera's axes, float64 (n, 3)."""
+    def _up_axis(self) -> NDArray[np.float64]:
+        """The vertical in camera axes, float64 (n, 3)."""
         pitch, roll = np.radians(self.pitch_deg), np.radians(self.roll_deg)
         level = -np.cos(pitch)
         return np.stack([level * np.sin(roll), level * np.cos(roll), np.sin(pitch)], 1)
 
     def _rate_deg_s(self, t_us: float) -> tuple[float, float, float]:
-        """How fast the angles change between the lines about a time."""
+        """Rates of pitch, roll and heading between the two lines around a time."""
         after = min(max(int(np.searchsorted(self.t_us, t_us, "right")), 1), len(self.t_us) - 1)
         dt_s = float(self.t_us[after] - self.t_us[after - 1]) * 1e-6
 
@@ -346,5 +345,5 @@ class AttitudeLog:
 
 
 def attitude_source(attitude: Attitude | AttitudeLog | None) -> Callable[[float], Attitude | None]:
-    """The attitude at a time, us; None where nothing is known."""
-    return attitude.at if isinstance(attitude, AttitudeLog) else lambda _t_us: attitude
+    """A function that gives the attitude at a time, us; None where it is unknown."""
+    return attitude.interpolate if isinstance(attitude, AttitudeLog) else lambda _t_us: attitude

@@ -1,4 +1,4 @@
-"""The bar: where a transmitter's LEDs stand, and which cluster each belongs to."""
+"""The bar: the positions of a transmitter's LEDs, and the cluster of each."""
 
 import math
 from collections.abc import Mapping
@@ -20,15 +20,15 @@ from evlcp_sdk.suggestions import nearest
 _MOST_LEDS = 1 << 16
 
 _MOST_M = 100.0
-"""Farther from the centre stands no LED of one transmitter."""
+"""Largest distance of an LED from its transmitter's centre."""
 
 _SAME_M = 1e-9
-_GAPLESS = 3.0
-"""Dark gaps between clusters, in widths of an LED, over which their light goes on."""
+_MOST_GAP_LEDS = 3.0
+"""Widest dark gap between clusters, in widths of an LED, that blur fills with their light."""
 
 Floats = NDArray[np.float64]
 Leds = tuple[Floats, NDArray[np.int64]]
-"""LED centres (x right, y down, z towards who looks at them), m, float64 (n, 3), and their clusters, (n,)."""
+"""LED centres (x right, y down, z towards the viewer), m, float64 (n, 3), and their clusters, int64 (n,)."""
 
 
 @dataclass(frozen=True)
@@ -49,17 +49,17 @@ class LedGrid:
     cluster_columns: Annotated[int, Field(gt=0, description="LED columns of a cluster.")] = 1
 
     def __post_init__(self) -> None:
-        _expect_number(self.rows * self.columns, f"bar.rows = {self.rows}, bar.columns = {self.columns}")
+        _check_count(self.rows * self.columns, f"bar.rows = {self.rows}, bar.columns = {self.columns}")
         for name in ("rows", "columns"):
-            _expect_divisor(f"cluster_{name}", getattr(self, f"cluster_{name}"), name, getattr(self, name))
+            _check_divisor(f"cluster_{name}", getattr(self, f"cluster_{name}"), name, getattr(self, name))
 
     @property
     def led_m(self) -> float:
         """Height that one LED lights, m."""
         return self.led_pitch_m
 
-    def placed(self) -> Leds:
-        """Where the LEDs stand, and their clusters."""
+    def place_leds(self) -> Leds:
+        """The LEDs' centres and clusters."""
         y, x = np.mgrid[: self.rows, : self.columns]
         across = self.columns // self.cluster_columns
         which = (y // self.cluster_rows) * across + x // self.cluster_columns
@@ -69,7 +69,7 @@ class LedGrid:
 
 @dataclass(frozen=True)
 class LedColumns:
-    """Columns of LEDs apart, such as a car's two lamps; clusters are counted down the first, then the next.
+    """Separate columns of LEDs, such as a car's two lamps; clusters are counted down each, column by column.
 
     Raises:
         ConfigError: Clusters do not tile a column, or there are more than 65536 LEDs.
@@ -82,16 +82,16 @@ class LedColumns:
     cluster_rows: Annotated[int, Field(gt=0, description="LEDs of a cluster.")] = 6
 
     def __post_init__(self) -> None:
-        _expect_number(self.rows * self.columns, f"bar.rows = {self.rows}, bar.columns = {self.columns}")
-        _expect_divisor("cluster_rows", self.cluster_rows, "rows", self.rows)
+        _check_count(self.rows * self.columns, f"bar.rows = {self.rows}, bar.columns = {self.columns}")
+        _check_divisor("cluster_rows", self.cluster_rows, "rows", self.rows)
 
     @property
     def led_m(self) -> float:
         """Height that one LED lights, m."""
         return self.led_pitch_m
 
-    def placed(self) -> Leds:
-        """Where the LEDs stand, and their clusters."""
+    def place_leds(self) -> Leds:
+        """The LEDs' centres and clusters."""
         x, y = np.mgrid[: self.columns, : self.rows]
         place = np.stack(
             [
@@ -107,7 +107,7 @@ class LedColumns:
 
 @dataclass(frozen=True)
 class LedRing:
-    """LEDs evenly on a circle, clockwise from the top as one looks at it, grouped in that order.
+    """LEDs evenly on a circle, grouped clockwise from the top as seen from the front.
 
     Raises:
         ConfigError: Clusters do not tile the ring.
@@ -119,10 +119,10 @@ class LedRing:
     led_m: Annotated[float, Field(ge=1e-6, le=1, description="Width and height that one LED lights.")] = 0.005
 
     def __post_init__(self) -> None:
-        _expect_divisor("cluster_leds", self.cluster_leds, "leds", self.leds)
+        _check_divisor("cluster_leds", self.cluster_leds, "leds", self.leds)
 
-    def placed(self) -> Leds:
-        """Where the LEDs stand, and their clusters."""
+    def place_leds(self) -> Leds:
+        """The LEDs' centres and clusters."""
         number = np.arange(self.leds)
         turn = 2 * np.pi * number / self.leds
         # To the nanometre, so that LEDs opposite each other stand in one row or column.
@@ -139,7 +139,7 @@ class LedTable:
     """Any LEDs: one row each, in any order; clusters of any size, counted from 0.
 
     Raises:
-        ConfigError: There are none or more than 65536, a cluster has no LED, or one is behind another.
+        ConfigError: There are none or more than 65536, a cluster has no LED or is behind another one.
     """
 
     leds: Annotated[
@@ -152,10 +152,10 @@ class LedTable:
     led_m: Annotated[float, Field(ge=1e-6, le=1, description="Width and height that one LED lights.")] = 0.005
 
     def __post_init__(self) -> None:
-        _expect_number(len(self.leds), f"bar.leds: {len(self.leds)} LEDs")
-        here: dict[tuple[int, ...], int] = {}
+        _check_count(len(self.leds), f"bar.leds: {len(self.leds)} LEDs")
+        taken: dict[tuple[int, ...], int] = {}
         for i, led in enumerate(self.leds):
-            first = here.setdefault(tuple(round(value * 1e6) for value in led[:3]), i)
+            first = taken.setdefault(tuple(round(value * 1e6) for value in led[:3]), i)
             if first != i:
                 raise ConfigError(f"bar.leds.{i}: stands where bar.leds.{first} does, to the micrometre")
         clusters = {led[3] for led in self.leds}
@@ -177,8 +177,8 @@ class LedTable:
                     " camera in front sees beside one another"
                 )
 
-    def placed(self) -> Leds:
-        """Where the LEDs stand, and their clusters."""
+    def place_leds(self) -> Leds:
+        """The LEDs' centres and clusters."""
         table = np.array(self.leds, np.float64)
         return table[:, :3].copy(), table[:, 3].astype(np.int64)
 
@@ -193,7 +193,7 @@ SHAPES: Mapping[str, type[Shape]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class BarLayout:
-    """A transmitter's LEDs and their clusters: a table, however it was described.
+    """A transmitter's LEDs and their clusters, whatever shape describes them.
 
     >>> BarLayout().clusters
     16
@@ -208,11 +208,11 @@ class BarLayout:
 
     @classmethod
     def of_table(cls, table: Mapping[str, Any]) -> "BarLayout":
-        """The layout that a table `[bar]` of a link describes; what it leaves out has its default.
+        """The layout that a link's table `[bar]` describes, with defaults for missing keys.
 
         Raises:
             SpecError: Keys or values are wrong.
-            ConfigError: Values that are right each by itself do not go together.
+            ConfigError: The values contradict one another.
         """
         keys = dict(table)
         name = keys.pop("shape", "grid")
@@ -224,12 +224,12 @@ class BarLayout:
 
     @cached_property
     def _leds(self) -> Leds:
-        place, which = self.shape.placed()
+        place, which = self.shape.place_leds()
         place.flags.writeable = which.flags.writeable = False
         return place, which
 
-    def table(self) -> dict[str, Any]:
-        """The table `[bar]` of a link that describes it, every default written out."""
+    def to_table(self) -> dict[str, Any]:
+        """The layout as a link's table `[bar]`, with every default."""
         name = next(name for name, shape in SHAPES.items() if isinstance(self.shape, shape))
         return ({} if name == "grid" else {"shape": name}) | asdict(self.shape)
 
@@ -251,7 +251,7 @@ class BarLayout:
         return float(np.ptp(self._leds[0][:, 0])) + self.shape.led_m
 
     def led_positions_m(self) -> Floats:
-        """LED centres (x right, y down, z towards who looks at them) from the bar's, m, float64 (n, 3)."""
+        """LED centres (x right, y down, z towards the viewer) from the bar's centre, m, float64 (n, 3)."""
         return self._leds[0]
 
     def led_clusters(self) -> NDArray[np.int64]:
@@ -259,27 +259,27 @@ class BarLayout:
         return self._leds[1]
 
     def cluster_positions_m(self) -> Floats:
-        """Cluster centres (x right, y down, z towards who looks at them), m, float64 (K, 3)."""
+        """Cluster centres (x right, y down, z towards the viewer), m, float64 (K, 3)."""
         place, which = self._leds
         count = np.bincount(which)
         return np.stack([np.bincount(which, place[:, i]) / count for i in range(3)], -1)
 
     def cluster_centres_m(self) -> Floats:
-        """Cluster centres (x right, y down) as one looks at them from the front, m, float64 (K, 2)."""
+        """Cluster centres (x right, y down) as seen from the front, m, float64 (K, 2)."""
         return self.cluster_positions_m()[:, :2]
 
     @property
-    def apart(self) -> bool:
-        """Whether centres of clusters are seen beside one another, and are not all at one place.
+    def has_distinct_centres(self) -> bool:
+        """Whether the clusters' centres, as seen from the front, are not all at one place.
 
         >>> ring = [(0.1, 0.0, 0.0, 1), (-0.1, 0.0, 0.0, 1)]
-        >>> BarLayout(LedTable(((0.0, 0.0, 0.0, 0), *ring))).apart
+        >>> BarLayout(LedTable(((0.0, 0.0, 0.0, 0), *ring))).has_distinct_centres
         False
         """
         return bool(np.ptp(self.cluster_centres_m(), axis=0).max() > _SAME_M)
 
     @cached_property
-    def alike(self) -> bool:
+    def has_equal_clusters(self) -> bool:
         """Whether all clusters have the same LEDs about their centres, to the micrometre."""
         place, which = self._leds
         off = np.round((place - self.cluster_positions_m()[which]) * 1e6)
@@ -291,77 +291,76 @@ class BarLayout:
         return bool((np.abs(forms - forms[0]) <= 1).all())
 
     @cached_property
-    def sides(self) -> NDArray[np.int64]:
-        """On which sides of each cluster light goes on in another one, int64 (K,).
+    def lit_sides(self) -> NDArray[np.int64]:
+        """Sides on which each cluster has a lit neighbour, int64 (K,).
 
-        The sum of 1 above, 2 below, 4 on the left and 8 on the right. To any other side a cluster looks
-        larger than it is, as blur has no neighbour's light to share pixels with. Light goes on over gaps of
-        up to three LEDs' width: some pixels of a bar 50 m away, which is what blur and wings fill.
+        The sum of 1 above, 2 below, 4 on the left and 8 on the right. On the other sides a cluster appears
+        larger than it is, as no neighbour's light shares the blurred pixels. A neighbour may be three LEDs'
+        widths away: some pixels of a bar 50 m away, which blur fills.
 
-        >>> BarLayout(LedGrid(18)).sides.tolist(), BarLayout(LedGrid(3, 2, cluster_rows=1)).sides.tolist()
+        >>> bar, panel = LedGrid(18), LedGrid(3, 2, cluster_rows=1)
+        >>> BarLayout(bar).lit_sides.tolist(), BarLayout(panel).lit_sides.tolist()
         ([2, 3, 1], [10, 6, 11, 7, 9, 5])
         """
         place, which = self._leds
         centres = self.cluster_centres_m()
         size = np.array([np.ptp(place[which == k, :2], axis=0) for k in range(self.clusters)])
-        most = (1 + _GAPLESS) * self.shape.led_m
-        found = np.zeros(self.clusters, np.int64)
+        most_m = (1 + _MOST_GAP_LEDS) * self.shape.led_m
+        sides = np.zeros(self.clusters, np.int64)
         off = centres[None] - centres[:, None]
         for axis, (before, after) in ((1, (1, 2)), (0, (4, 8))):
             along, across = off[..., axis], off[..., 1 - axis]
             gap = np.abs(along) - (size[:, None, axis] + size[None, :, axis]) / 2
-            touches = (np.abs(across) <= _SAME_M) & (np.abs(along) > _SAME_M) & (gap <= most)
-            found += before * (touches & (along < 0)).any(1)
-            found += after * (touches & (along > 0)).any(1)
-        return found
+            touches = (np.abs(across) <= _SAME_M) & (np.abs(along) > _SAME_M) & (gap <= most_m)
+            sides += before * (touches & (along < 0)).any(1)
+            sides += after * (touches & (along > 0)).any(1)
+        return sides
 
     @cached_property
-    def alike_sides(self) -> NDArray[np.bool_]:
-        """Which clusters have light on the same sides as most have, bool (K,): they look too large alike.
+    def has_usual_sides(self) -> NDArray[np.bool_]:
+        """Which clusters have lit neighbours on the most common sides, bool (K,), so that all appear equal.
 
-        >>> BarLayout(LedGrid(24)).alike_sides.tolist()
+        >>> BarLayout(LedGrid(24)).has_usual_sides.tolist()
         [False, True, True, False]
         """
-        return np.asarray(self.sides == np.bincount(self.sides).argmax())
+        return np.asarray(self.lit_sides == np.bincount(self.lit_sides).argmax())
 
     @property
-    def in_even_line(self) -> bool:
+    def is_even_line(self) -> bool:
         """Whether the clusters stand in one straight line, in order and evenly; one cluster does."""
         steps = np.diff(self.cluster_positions_m(), axis=0)
         return len(steps) == 0 or bool(np.abs(steps - steps[0]).max() <= 1e-6 * np.abs(steps[0]).max())
 
     @property
     def column_pitch_m(self) -> float:
-        """From cluster to cluster of one even column, the first at its top, m; NaN for another layout.
-
-        Clusters of an even column are alike.
+        """Spacing of equal clusters in one even column, the first at its top, m; NaN for another layout.
 
         >>> round(BarLayout().column_pitch_m, 9)
         0.06
         """
-        return self._pitch_m(np.arange(self.clusters)) if self.alike else math.nan
+        return self._pitch_m(np.arange(self.clusters)) if self.has_equal_clusters else math.nan
 
     @cached_property
     def even_columns(self) -> tuple[tuple[NDArray[np.int64], float], ...]:
-        """Columns of three clusters or more, evenly one below another: clusters from the top, and pitch, m.
+        """Columns of three evenly spaced clusters or more: their clusters from the top, and pitch, m.
 
-        None unless all clusters are alike.
+        Empty unless all clusters are equal.
 
         >>> [(ids.tolist(), round(m, 9)) for ids, m in BarLayout(LedGrid(12, 2, 0.01, 3)).even_columns]
         [([0, 2, 4, 6], 0.03), ([1, 3, 5, 7], 0.03)]
         """
-        if not self.alike:
+        if not self.has_equal_clusters:
             return ()
         across = np.round(self.cluster_positions_m()[:, [0, 2]] / _SAME_M)
         columns: dict[tuple[float, ...], list[int]] = {}
         for k in np.argsort(self.cluster_positions_m()[:, 1], kind="stable").tolist():
             columns.setdefault(tuple(across[k]), []).append(k)
-        lines = (np.array(columns[at], np.int64) for at in sorted(columns))
-        found = ((ids, self._pitch_m(ids)) for ids in lines if len(ids) >= 3)
-        return tuple((ids, pitch_m) for ids, pitch_m in found if pitch_m > 0)
+        by_place = (np.array(columns[place], np.int64) for place in sorted(columns))
+        pitches = ((ids, self._pitch_m(ids)) for ids in by_place if len(ids) >= 3)
+        return tuple((ids, pitch_m) for ids, pitch_m in pitches if pitch_m > 0)
 
     def _pitch_m(self, clusters: NDArray[np.int64]) -> float:
-        """From one to the next of clusters that stand evenly one below another, m; NaN of others."""
+        """Spacing of clusters that are evenly one below another, m; NaN for others."""
         steps = np.diff(self.cluster_positions_m()[clusters], axis=0)
         if len(steps) == 0 or np.abs(steps[:, [0, 2]]).max() > _SAME_M:
             return math.nan
@@ -370,15 +369,15 @@ class BarLayout:
 
 
 def read_leds(path: Path | str) -> list[list[float | int]]:
-    """The rows [x, y, z, cluster] of a CSV file with the columns x_m, y_m, cluster and, if it has one, z_m.
+    """Rows [x, y, z, cluster] of a CSV file with the columns x_m, y_m, cluster and optionally z_m.
 
     Raises:
         InputError: The file cannot be read, or is not CSV.
-        ConfigError: A column is missing, a value is not what it should be, or there are more than 65536 LEDs.
+        ConfigError: A column is missing, a value is out of range, or there are more than 65536 LEDs.
     """
-    within = (-_MOST_M, _MOST_M)
-    needed = {"x_m": within, "y_m": within, "cluster": (0, _MOST_LEDS - 1)}
-    lines, table = read_table(path, needed, {"z_m": within})
+    limits = (-_MOST_M, _MOST_M)
+    needed = {"x_m": limits, "y_m": limits, "cluster": (0, _MOST_LEDS - 1)}
+    lines, table = read_table(path, needed, {"z_m": limits})
     if len(lines) > _MOST_LEDS:
         raise ConfigError(f"{path}: line {lines[_MOST_LEDS]}: expected at most {_MOST_LEDS} LEDs")
     for line, cluster in zip(lines, table["cluster"].tolist(), strict=True):
@@ -389,12 +388,12 @@ def read_leds(path: Path | str) -> list[list[float | int]]:
     return [list(row) for row in zip(x.tolist(), y.tolist(), z.tolist(), cluster.tolist(), strict=True)]
 
 
-def _expect_number(leds: int, problem: str) -> None:
+def _check_count(leds: int, problem: str) -> None:
     if not 0 < leds <= _MOST_LEDS:
         least = "" if leds else ", and one at least"
         raise ConfigError(f"{problem}: expected at most {_MOST_LEDS} LEDs{least}")
 
 
-def _expect_divisor(name: str, block: int, of: str, n: int) -> None:
+def _check_divisor(name: str, block: int, of: str, n: int) -> None:
     if n % block:
         raise ConfigError(f"bar.{name} = {block}: expected a divisor of bar.{of} = {n}")

@@ -11,12 +11,12 @@ from pydantic import Field
 from evlcp_sdk.errors import ConfigError
 
 CAMERA_PARAMETERS = ("focal_mm", "centre_x_px", "centre_y_px", "k1", "k2", "p1", "p2")
-"""What a calibration estimates of a camera, in the order of covariances."""
+"""The parameters that a calibration estimates, in the order of covariances."""
 
 _NEWTON_STEPS = 12
-"""Each doubles the digits; four suffice for what lenses do."""
+"""Each doubles the digits; four suffice for real lenses."""
 
-_ARRIVED = 1e-15
+_ROUNDING = 1e-15
 """A step of a direction that is rounding: a few units in the last place of directions near 1."""
 
 
@@ -68,7 +68,7 @@ class CameraModel:
         return self.width / 2 if x is None else x, self.height / 2 if y is None else y
 
     def project(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where points along the camera's axes are seen, px; NaN for points that are not in front of it.
+        """Pixel positions (column, row) of points in camera axes; NaN for points that are not in front.
 
         Args:
             points_m: x right, y down, z forward, m, float64 (..., 3).
@@ -77,22 +77,22 @@ class CameraModel:
         return self.distort(points_m[..., :2] / np.where(z > 0, z, np.nan))
 
     def distort(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where directions (x / z, y / z), float64 (..., 2), are seen: (column, row), px, the same shape."""
+        """Pixel positions (column, row) of directions (x / z, y / z), float64 (..., 2) both."""
         if self.is_pinhole:
             return direction * self.focal_px + self.centre_px
         u, v = direction[..., 0], direction[..., 1]
         r2 = u * u + v * v
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        bent_u = u * radial + 2 * self.p1 * u * v + self.p2 * (r2 + 2 * u * u)
-        bent_v = v * radial + self.p1 * (r2 + 2 * v * v) + 2 * self.p2 * u * v
-        return np.stack([bent_u, bent_v], -1) * self.focal_px + self.centre_px
+        distorted_u = u * radial + 2 * self.p1 * u * v + self.p2 * (r2 + 2 * u * u)
+        distorted_v = v * radial + self.p1 * (r2 + 2 * v * v) + 2 * self.p2 * u * v
+        return np.stack([distorted_u, distorted_v], -1) * self.focal_px + self.centre_px
 
-    def distort_slope(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives of `distort`, px, float64 (..., 2, 2): of column and row by the direction's parts."""
+    def distortion_jacobian(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives of `distort` (column and row) by the direction, px, float64 (..., 2, 2)."""
         if self.is_pinhole:
-            straight = np.zeros((*direction.shape, 2))
-            straight[..., 0, 0] = straight[..., 1, 1] = self.focal_px
-            return straight
+            jacobian = np.zeros((*direction.shape, 2))
+            jacobian[..., 0, 0] = jacobian[..., 1, 1] = self.focal_px
+            return jacobian
         u, v = direction[..., 0], direction[..., 1]
         r2 = u * u + v * v
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -100,26 +100,26 @@ class CameraModel:
         cross = u * v * growth + 2 * self.p1 * u + 2 * self.p2 * v
         uu = radial + u * u * growth + 2 * self.p1 * v + 6 * self.p2 * u
         vv = radial + v * v * growth + 6 * self.p1 * v + 2 * self.p2 * u
-        slope: NDArray[np.float64] = np.stack([np.stack([uu, cross], -1), np.stack([cross, vv], -1)], -2)
-        return slope * self.focal_px
+        jacobian = np.stack([np.stack([uu, cross], -1), np.stack([cross, vv], -1)], -2)
+        return np.asarray(jacobian * self.focal_px)
 
-    def project_slope(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives of `project` by the point, px / m, float64 (..., 2, 3), for points in front."""
+    def projection_jacobian(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives of `project` by the points, px / m, float64 (..., 2, 3); the points are in front."""
         z = points_m[..., 2]
         direction = points_m[..., :2] / z[..., None]
-        turned = np.zeros((*z.shape, 2, 3))
-        turned[..., 0, 0] = turned[..., 1, 1] = 1 / z
-        turned[..., 2] = -direction / z[..., None]
-        return self.distort_slope(direction) @ turned
+        by_point = np.zeros((*z.shape, 2, 3))
+        by_point[..., 0, 0] = by_point[..., 1, 1] = 1 / z
+        by_point[..., 2] = -direction / z[..., None]
+        return self.distortion_jacobian(direction) @ by_point
 
-    def parameter_slope(
+    def parameter_jacobian(
         self, direction: NDArray[np.float64], seen_px: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
         """Derivatives of `distort` by `CAMERA_PARAMETERS`, the focal length in px: float64 (..., 2, 7).
 
         Args:
             direction: float64 (..., 2).
-            seen_px: `distort` of it, where that is known.
+            seen_px: `distort(direction)`, if the caller has it already.
         """
         seen_px = self.distort(direction) if seen_px is None else seen_px
         u, v, f = direction[..., 0], direction[..., 1], self.focal_px
@@ -134,33 +134,33 @@ class CameraModel:
         return slope
 
     def undistort(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Directions (x / z, y / z) that are seen at (column, row), px: the inverse of `distort`.
+        """Directions (x / z, y / z) of pixel positions (column, row): the inverse of `distort`.
 
-        Newton steps from the undistorted direction; NaN where they do not arrive, as for a pixel beyond the
+        Newton steps from the undistorted direction; NaN where they do not converge, as for a pixel beyond the
         largest angle that a strong distortion can show.
 
         Args:
             points_px: float64 (..., 2).
         """
-        straight = (points_px - self.centre_px) / self.focal_px
+        undistorted = (points_px - self.centre_px) / self.focal_px
         if self.is_pinhole:
-            return straight
-        found = straight.copy()
+            return undistorted
+        found = undistorted.copy()
         for _ in range(_NEWTON_STEPS):
-            slope = self.distort_slope(found) / self.focal_px
-            miss = straight - (self.distort(found) - self.centre_px) / self.focal_px
-            a, b, d = slope[..., 0, 0], slope[..., 0, 1], slope[..., 1, 1]
-            # The slope turns singular, and then negative, at the largest angle that is shown.
-            size = np.where((a > 0) & (a * d > b * b), a * d - b * b, np.nan)
-            step_u = (d * miss[..., 0] - b * miss[..., 1]) / size
-            step_v = (a * miss[..., 1] - b * miss[..., 0]) / size
-            # Each point by itself, whatever others are with it: it stays once a step is rounding.
-            far = ~(np.maximum(np.abs(step_u), np.abs(step_v)) <= _ARRIVED)
-            if not far.any():
+            jacobian = self.distortion_jacobian(found) / self.focal_px
+            miss = undistorted - (self.distort(found) - self.centre_px) / self.focal_px
+            a, b, d = jacobian[..., 0, 0], jacobian[..., 0, 1], jacobian[..., 1, 1]
+            # The Jacobian turns singular, and then negative, at the largest angle that is shown.
+            determinant = np.where((a > 0) & (a * d > b * b), a * d - b * b, np.nan)
+            step_u = (d * miss[..., 0] - b * miss[..., 1]) / determinant
+            step_v = (a * miss[..., 1] - b * miss[..., 0]) / determinant
+            # Each point stops when its own step is rounding, so that no point depends on the others.
+            moves = ~(np.maximum(np.abs(step_u), np.abs(step_v)) <= _ROUNDING)
+            if not moves.any():
                 break
-            found = np.where(far[..., None], found + np.stack([step_u, step_v], -1), found)
-        away = np.abs(self.distort(found) - points_px).max(-1, keepdims=True)
-        return np.where(away < 1e-6, found, np.nan)
+            found = np.where(moves[..., None], found + np.stack([step_u, step_v], -1), found)
+        residual_px = np.abs(self.distort(found) - points_px).max(-1, keepdims=True)
+        return np.where(residual_px < 1e-6, found, np.nan)
 
     @cached_property
     def is_pinhole(self) -> bool:
@@ -168,7 +168,7 @@ class CameraModel:
         return self.k1 == self.k2 == self.p1 == self.p2 == self.k3 == 0
 
     def direction(self, x_px: float, y_px: float) -> tuple[float, float]:
-        """The same as `undistort` of one point (column, row), px."""
+        """Direction (x / z, y / z) of one pixel position: `undistort` of a single point."""
         if self.is_pinhole:
             (centre_x_px, centre_y_px), focal_px = self.centre_px, self.focal_px
             return (x_px - centre_x_px) / focal_px, (y_px - centre_y_px) / focal_px
@@ -176,26 +176,24 @@ class CameraModel:
         return u, v
 
     def distance_m(self, spacing_m: float, spacing_px: float) -> float:
-        """Depth along the optical axis of two points parallel to the sensor: L = f S / (l' a).
-
-        arXiv 2510.17203, equation for L.
+        """Depth of two points parallel to the sensor, m: L = f S / (l' a) of arXiv 2510.17203.
 
         Args:
             spacing_m: Their distance S from each other, m.
-            spacing_px: The same in the image, l', px.
+            spacing_px: Their distance in the image, l', px.
         """
         return self.focal_px * spacing_m / spacing_px
 
 
 @dataclass(frozen=True)
 class CameraSigma:
-    """How precisely the camera is known, as a calibration says: standard deviations, and how they correlate.
+    """Standard deviations of the camera's parameters, and their correlation, from a calibration.
 
     Raises:
-        ConfigError: The correlation is not one of seven parameters: of another shape, with a diagonal other
-            than 1, not symmetric, or of negative variance in some direction.
+        ConfigError: The correlation is not that of seven parameters: its shape is another, its diagonal is
+            not 1, it is not symmetric, or it has a direction of negative variance.
 
-    >>> CameraSigma(focal_mm=0.035).root(CameraModel())[0, 0].round(2)
+    >>> CameraSigma(focal_mm=0.035).covariance_root(CameraModel())[0, 0].round(2)
     np.float64(7.2)
     """
 
@@ -228,16 +226,16 @@ class CameraSigma:
             raise ConfigError("camera_sigma.correlation: expected no direction of negative variance")
 
     @property
-    def known(self) -> bool:
-        """Whether anything is said."""
+    def is_known(self) -> bool:
+        """Whether any parameter has a standard deviation."""
         return any(getattr(self, name) > 0 for name in CAMERA_PARAMETERS)
 
-    def root(self, camera: CameraModel) -> NDArray[np.float64]:
-        """A lower root of the covariance of these seven, the focal length in px: float64 (7, 7)."""
+    def covariance_root(self, camera: CameraModel) -> NDArray[np.float64]:
+        """Lower root of the seven parameters' covariance, the focal length in px: float64 (7, 7)."""
         sigma = np.array([getattr(self, name) for name in CAMERA_PARAMETERS])
         sigma[0] *= camera.focal_px / camera.focal_mm
         if not self.correlation:
             return np.diag(sigma)
-        # What is written with few digits may be singular by rounding.
+        # A correlation that is written with few digits may be singular.
         matrix = np.array(self.correlation) + 1e-9 * np.eye(len(sigma))
         return np.asarray(sigma[:, None] * np.linalg.cholesky((matrix + matrix.T) / 2))

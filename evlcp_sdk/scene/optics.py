@@ -1,4 +1,4 @@
-"""What a lens makes of a point, and of an edge: the Airy pattern's wings, and light on square pixels."""
+"""The image of a point and of an edge by a lens: the Airy pattern's wings, and light on square pixels."""
 
 import math
 from dataclasses import dataclass
@@ -30,20 +30,20 @@ sqrt(2 / pi) times the integral of exp(-r^2 / (2 s^2)) / s^2 over s, here a sum 
 differs from the integral by 0.2 %."""
 
 WIDEST_WING_PX = 32.0
-"""Sigma up to which there are wings, px; what an ideal lens throws further is added to the widest of them."""
+"""Largest sigma of a wing, px; the light that an ideal lens spreads further is added to the widest wing."""
 
 REACH_PX = 20.0
-"""How far a strip's light is followed, px: further from a line an ideal f/2 lens at 630 nm throws 0.17 %
-of the light, a tenth of what the halo has there, whose share is a guess."""
+"""Distance from a strip up to which its light is computed, px: an ideal f/2 lens at 630 nm spreads 0.17 % of
+a line's light further, a tenth of the halo's, whose share is a guess."""
 
 
 @dataclass(frozen=True, eq=False)
 class Blur:
-    """The image of a point, without the halo: round Gaussians, one over another.
+    """The image of a point, without the halo: a sum of round Gaussians.
 
     Attributes:
         sigma_px: Their sigmas, rising, px, float64 (n,).
-        share: Share of the light in each, float64 (n,); 1 together.
+        share: Share of the light in each, float64 (n,), of sum 1.
     """
 
     sigma_px: Floats
@@ -51,29 +51,29 @@ class Blur:
 
     @property
     def reach_px(self) -> float:
-        """How far from an edge its light is followed, px."""
+        """Distance from an edge up to which its light is computed, px."""
         core_px = 5 * float(self.sigma_px[0]) + 0.5
         return core_px if len(self.sigma_px) == 1 else max(core_px, REACH_PX)
 
 
-def airy_blur(unit_px: float, other_px: float) -> Blur:
+def airy_blur(unit_px: float, gaussian_px: float) -> Blur:
     """The Airy pattern of a round aperture, blurred by a Gaussian.
 
     Args:
         unit_px: Wavelength times f-number, px.
-        other_px: Sigma of the Gaussian, px.
+        gaussian_px: Sigma of the Gaussian, px.
     """
-    sigma, share = _airy_pattern(unit_px)
-    return Blur(np.hypot(sigma * unit_px, other_px), share)
+    sigma, share = _airy_gaussians(unit_px)
+    return Blur(np.hypot(sigma * unit_px, gaussian_px), share)
 
 
 @lru_cache(16)
-def _airy_pattern(unit_px: float) -> tuple[Floats, Floats]:
-    """Sigmas, wavelengths times f-number, and shares of its Gaussians; a scene asks for it in every block."""
+def _airy_gaussians(unit_px: float) -> tuple[Floats, Floats]:
+    """Sigmas, in wavelengths times f-number, and shares of the Airy pattern's Gaussians."""
     wings = max(1, 1 + math.floor(math.log2(WIDEST_WING_PX / (FIRST_WING_SIGMA * unit_px))))
     sigma = FIRST_WING_SIGMA * 2.0 ** np.arange(wings)
     share = WING_SHARE / sigma
-    # The wings that are left out have as much together as the widest of the others.
+    # The omitted wings have as much light together as the widest of the others.
     share[-1] *= 2
     all_sigma: Floats = np.append(CORE_SIGMA, sigma)
     all_share = np.asarray(np.append(1 - share.sum(), share), np.float64)
@@ -82,13 +82,13 @@ def _airy_pattern(unit_px: float) -> tuple[Floats, Floats]:
     return all_sigma, all_share
 
 
-def _integral(z: Floats, sigma: Floats | float) -> Floats:
-    """Integral of the normal distribution function with this sigma up to z."""
+def _integrated_cdf(z: Floats, sigma: Floats | float) -> Floats:
+    """Integral of a normal distribution function up to z."""
     density = np.exp(-0.5 * (z / sigma) ** 2) / math.sqrt(2 * math.pi)
     total: Floats = z * special.ndtr(z / sigma) + sigma * density
     return total
 
 
-def step(z: Floats, sigma: Floats | float) -> Floats:
-    """Share of a pixel at `z` that is lit beyond an edge at 0, blurred by a Gaussian."""
-    return _integral(z + 0.5, sigma) - _integral(z - 0.5, sigma)
+def blurred_edge(z: Floats, sigma: Floats | float) -> Floats:
+    """Lit share of a pixel at `z` from an edge at 0 that a Gaussian blurs."""
+    return _integrated_cdf(z + 0.5, sigma) - _integrated_cdf(z - 0.5, sigma)

@@ -1,7 +1,7 @@
-"""Where transmitters stand on earth: `site.toml`, and the local axes that positions are computed in.
+"""Geodetic positions of transmitters: `site.toml`, and the local axes in which positions are computed.
 
-Heights are above the WGS-84 ellipsoid. Local axes point to the east, to the north and up (ENU) at
-an origin near the bars. See `docs/position.md`.
+Heights are above the WGS-84 ellipsoid. Local axes point east, north and up (ENU) at an origin near the bars.
+See `docs/position.md`.
 """
 
 import math
@@ -20,18 +20,17 @@ from evlcp_sdk.specs import SpecError, build, read_toml, toml_value
 from evlcp_sdk.suggestions import nearest
 
 _LEAST_UPRIGHT = 0.1
-"""Sine of an axis' elevation below which it lies: LEDs then face level, whatever they are turned about it."""
+"""Sine of a bar axis' elevation below which the bar counts as lying, so that its LEDs face horizontally."""
 
 _LEAST_FACING = 0.01
-"""Sine of the angle between a bar's axis and where it faces, below which the latter says nothing."""
+"""Sine of the angle between a bar's axis and its facing, below which the facing is undetermined."""
 
 
 @dataclass(frozen=True)
 class BarSite:
-    """Where one bar stands, and how: a `[[bar]]` of `site.toml`, and what its beacon says.
+    """Position and attitude of one bar: a `[[bar]]` of `site.toml`, and the content of its beacon.
 
-    Its axis points from its bottom to its top, where its first cluster is: up, and tilted from there towards
-    `heading_deg`.
+    Its axis points from its bottom to its top, where its first cluster is: up, tilted towards `heading_deg`.
 
     >>> BarSite(7, 35.0, 137.0, 50.0, tilt_deg=90.0, heading_deg=90.0).axis_enu().round(6).tolist()
     [1.0, 0.0, 0.0]
@@ -85,41 +84,37 @@ class BarSite:
     ] = None
 
     @property
-    def survey(self) -> tuple[float, float, float]:
-        """Sigmas of its place, m, of a turn about each axis, radians, and of its length, as a share."""
-        place, turn = self.position_sigma_m or 0.0, math.radians(self.attitude_sigma_deg)
-        return place, turn, self.length_sigma_m / self.length_m
+    def survey_sigmas(self) -> tuple[float, float, float]:
+        """Sigmas of position, m, of rotation about each axis, radians, and of length, as a share of it."""
+        rotation_rad = math.radians(self.attitude_sigma_deg)
+        return self.position_sigma_m or 0.0, rotation_rad, self.length_sigma_m / self.length_m
 
     def axis_enu(self) -> NDArray[np.float64]:
         """Unit vector from its bottom to its top, in east, north and up at its own centre, float64 (3,)."""
         heading, tilt = math.radians(self.heading_deg), math.radians(self.tilt_deg)
-        lean = math.sin(tilt)
-        return np.array([lean * math.sin(heading), lean * math.cos(heading), math.cos(tilt)])
+        level = math.sin(tilt)
+        return np.array([level * math.sin(heading), level * math.cos(heading), math.cos(tilt)])
 
     def cluster_positions_m(self, clusters: int, axes: "LocalAxes") -> NDArray[np.float64]:
         """Centres of its clusters in local axes, from its top, m, float64 (clusters, 3).
 
         Args:
-            clusters: How many equal parts the bar is cut into.
+            clusters: Number of equal parts of the bar.
             axes: The local axes.
         """
         along = (0.5 - (np.arange(clusters) + 0.5) / clusters) * self.length_m
-        return self._in_axes(along[:, None] * self.axis_enu(), axes)
+        return self._to_local_axes(along[:, None] * self.axis_enu(), axes)
 
     def layout_positions_m(self, bar: BarLayout, axes: "LocalAxes") -> NDArray[np.float64]:
         """Centres of the clusters of a layout in local axes, m, float64 (K, 3).
 
-        Clusters evenly in line stand along the axis, from its top; others about the centre, as one who looks
-        at the front sees them, as large as `length_m` says.
-
-        Args:
-            bar: The layout.
-            axes: The local axes.
+        Clusters evenly in line are along the axis, from its top; others around the centre, as seen from the
+        front, scaled to `length_m`.
 
         Raises:
-            ConfigError: The clusters are not in line, and the site does not say where the LEDs face.
+            ConfigError: The clusters are not in line, and the site lacks `facing_deg`.
         """
-        if bar.in_even_line:
+        if bar.is_even_line:
             return self.cluster_positions_m(bar.clusters, axes)
         name = f"site of id {self.transmitter_id}"
         if self.facing_deg is None:
@@ -127,7 +122,7 @@ class BarSite:
         up, facing = self.axis_enu(), math.radians(self.facing_deg)
         towards = np.array([math.sin(facing), math.cos(facing), 0.0])
         if abs(up[2]) >= _LEAST_UPRIGHT:
-            # Square to the axis, and over the horizon where it says.
+            # At a right angle to the axis, above or below the facing on the horizon.
             towards[2] = -(towards @ up) / up[2]
         else:
             towards -= (towards @ up) * up
@@ -135,14 +130,14 @@ class BarSite:
             raise ConfigError(f"{name}: facing_deg = {self.facing_deg:g}: its axis points there")
         towards /= np.linalg.norm(towards)
         x, y, z = bar.cluster_positions_m().T[:, :, None] * (self.length_m / bar.length_m)
-        return self._in_axes(x * np.cross(up, towards) - y * up + z * towards, axes)
+        return self._to_local_axes(x * np.cross(up, towards) - y * up + z * towards, axes)
 
-    def _in_axes(self, offset: NDArray[np.float64], axes: "LocalAxes") -> NDArray[np.float64]:
-        """Points that lie so far from its centre, east, north and up there, in local axes, m, (n, 3)."""
+    def _to_local_axes(self, offset: NDArray[np.float64], axes: "LocalAxes") -> NDArray[np.float64]:
+        """Points by their offsets east, north and up from the bar's centre, in local axes, m, (n, 3)."""
         import pymap3d
 
-        here = (self.latitude_deg, self.longitude_deg, self.height_m)
-        ecef = pymap3d.enu2ecef(*offset.T, *here)
+        centre = (self.latitude_deg, self.longitude_deg, self.height_m)
+        ecef = pymap3d.enu2ecef(*offset.T, *centre)
         return np.stack(pymap3d.ecef2enu(*ecef, *axes.origin), -1)
 
 
@@ -161,7 +156,7 @@ class LocalAxes:
 
     @classmethod
     def of(cls, sites: Sequence[BarSite]) -> "LocalAxes":
-        """The axes at the centre of the first of these bars.
+        """The axes at the centre of the first bar.
 
         Raises:
             ConfigError: There is none.
@@ -176,18 +171,18 @@ class LocalAxes:
         """Latitude, longitude and height of the origin."""
         return self.latitude_deg, self.longitude_deg, self.height_m
 
-    def turn_from(self, other: "LocalAxes") -> NDArray[np.float64]:
-        """What turns vectors along other axes into these, float64 (3, 3): 0.009 degrees a kilometre.
+    def rotation_from(self, other: "LocalAxes") -> NDArray[np.float64]:
+        """Rotation of vectors from other axes into these, float64 (3, 3): 0.009 degrees a kilometre.
 
         >>> far = LocalAxes(35.1, 137.0, 50.0)
-        >>> up = LocalAxes(35.0, 137.0, 50.0).turn_from(far)[:, 2]
+        >>> up = LocalAxes(35.0, 137.0, 50.0).rotation_from(far)[:, 2]
         >>> round(float(np.degrees(np.arctan2(up[1], up[2]))), 3)
         0.1
         """
-        return np.asarray(self._in_ecef() @ other._in_ecef().T)
+        return np.asarray(self._ecef_axes() @ other._ecef_axes().T)
 
-    def _in_ecef(self) -> NDArray[np.float64]:
-        """East, north and up along the earth's axes (ECEF), as rows."""
+    def _ecef_axes(self) -> NDArray[np.float64]:
+        """East, north and up in the earth's axes (ECEF), as rows."""
         import pymap3d
 
         return np.stack(pymap3d.enu2uvw(*np.eye(3), self.latitude_deg, self.longitude_deg), -1)
@@ -211,7 +206,7 @@ class LocalAxes:
 
 
 @dataclass(frozen=True)
-class _File:
+class _SiteFile:
     bar: tuple[BarSite, ...]
 
 
@@ -229,7 +224,7 @@ def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSit
 
     Args:
         table: As read from TOML: `bar`, a list of tables.
-        source: What faults name as their place.
+        source: Name of the file in errors.
 
     Raises:
         ConfigError: One line per fault, each with its path, e.g. `bar.0.latitude_deg`.
@@ -238,15 +233,15 @@ def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSit
     >>> resolve_sites({"bar": [bar]})[0].length_m
     0.96
     """
-    before = f"{source}: " if source else ""
+    prefix = f"{source}: " if source else ""
     rows = table.get("bar")
     if not isinstance(rows, list) or not rows:
-        lines = [f"{before}{key}: unknown table{nearest(key, ['bar'])}" for key in table if key != "bar"]
-        raise ConfigError("\n".join([*lines, f"{before}bar: expected one [[bar]] or more"]))
+        lines = [f"{prefix}{key}: unknown table{nearest(key, ['bar'])}" for key in table if key != "bar"]
+        raise ConfigError("\n".join([*lines, f"{prefix}bar: expected one [[bar]] or more"]))
     try:
-        sites = build(_File, table).bar
-    except SpecError as refused:
-        raise ConfigError("\n".join(refused.lines(before))) from refused
+        sites = build(_SiteFile, table).bar
+    except SpecError as fault:
+        raise ConfigError("\n".join(fault.lines(prefix))) from fault
     faults = []
     for name in ("transmitter_id", "transmitter"):
         first: dict[int, int] = {}
@@ -254,14 +249,14 @@ def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSit
             number = getattr(site, name)
             if number is not None and first.setdefault(number, i) != i:
                 same = f"bar.{first[number]} has it, too; expected one each"
-                faults.append(f"{before}bar.{i}.{name} = {number}: {same}")
+                faults.append(f"{prefix}bar.{i}.{name} = {number}: {same}")
     if faults:
         raise ConfigError("\n".join(faults))
     return sites
 
 
 def to_toml(sites: Sequence[BarSite]) -> str:
-    """The text of a `site.toml`; `load_sites` takes it back."""
+    """Sites as the text of a `site.toml` for `load_sites`."""
     lines = []
     for site in sites:
         values = ((f.name, getattr(site, f.name)) for f in fields(site))
@@ -274,22 +269,22 @@ def to_toml(sites: Sequence[BarSite]) -> str:
 
 
 def site_of_transmitter(
-    sites: Sequence[BarSite], transmitter: int, transmitter_id: int | None = None, *, alone: bool = False
+    sites: Sequence[BarSite], transmitter: int, transmitter_id: int | None = None, *, is_only: bool = False
 ) -> BarSite | None:
-    """Which site a received transmitter stands at; None when nothing says so.
+    """The site of a received transmitter; None if it is unknown.
 
-    Its beacon's id decides; without one the `transmitter` of a site does; and a transmitter that is the only
-    one received stands at the only site.
+    The id in its beacon decides, without one a site's `transmitter`. The only transmitter received is at the
+    only site.
 
     Args:
         sites: The known bars.
         transmitter: Number that the receiver gave it.
-        transmitter_id: What its beacon said, None before the first.
-        alone: It is the only transmitter received.
+        transmitter_id: The id in its beacon; None before the first.
+        is_only: Whether it is the only transmitter received.
     """
     if transmitter_id is not None:
         return next((s for s in sites if s.transmitter_id == transmitter_id), None)
     named = next((s for s in sites if s.transmitter == transmitter), None)
-    if named is None and alone and len(sites) == 1 and sites[0].transmitter is None:
+    if named is None and is_only and len(sites) == 1 and sites[0].transmitter is None:
         return sites[0]
     return named

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.scene.optics import Blur, airy_blur, step
+from evlcp_sdk.scene.optics import Blur, airy_blur, blurred_edge
 from evlcp_sdk.sim.leds import LitStrip
 from evlcp_sdk.sim.scene import BarSpec, DropSpec, LensSpec
 
@@ -98,7 +98,9 @@ def strip_table(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> Flo
     u = np.arange(nodes) / nodes
     # The last node is at infinity; any number stands for it beside which the blur is small.
     z = np.append(scale_px * u / (1 - u), 1e6 * scale_px)
-    steps = step(np.concatenate([z + strip_px / 2, z - strip_px / 2, -z[:0:-1]]), blur.sigma_px[:, None])
+    steps = blurred_edge(
+        np.concatenate([z + strip_px / 2, z - strip_px / 2, -z[:0:-1]]), blur.sigma_px[:, None]
+    )
     right, left, before = np.split(steps, [nodes + 1, 2 * nodes + 2], axis=1)
     across = right - left
     along = np.concatenate([before, np.full((len(before), 1), 0.5), 1 - before[:, ::-1]], axis=1)

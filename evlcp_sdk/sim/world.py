@@ -86,7 +86,7 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
                 tilt_deg=math.degrees(math.atan2(lean, up)),
                 length_m=link.bar.length_m,
                 position_sigma_m=0.0,
-                facing_deg=None if link.bar.in_even_line else facing,
+                facing_deg=None if link.bar.is_even_line else facing,
             )
         )
     return tuple(sites)

@@ -47,7 +47,7 @@ class CentroidRanging(Ranging):
         centres = bar.cluster_centres_m()
         in_line = np.linalg.matrix_rank(centres - centres.mean(0), tol=1e-9) < 2
         skip = self.skip_outer if in_line else 0
-        same = bar.alike_sides if self.skip_outer and not in_line else np.ones(bar.clusters, np.bool_)
+        same = bar.has_usual_sides if self.skip_outer and not in_line else np.ones(bar.clusters, np.bool_)
         left = int(same.sum()) - 2 * skip
         least = max(min(self.min_clusters, left), 3)
         if left < least:
@@ -55,7 +55,7 @@ class CentroidRanging(Ranging):
                 f"ranging 'centroid' uses {max(left, 0)} of {bar.clusters} clusters (skip_outer ="
                 f" {skip}), expected at least min_clusters = {least}"
             )
-        if not bar.apart:
+        if not bar.has_distinct_centres:
             raise ConfigError("ranging 'centroid' needs clusters apart: use 'none' for this layout")
         layout = centres[:, 0] + 1j * centres[:, 1]
         i, j = np.triu_indices(bar.clusters, 1)

@@ -100,16 +100,16 @@ class PocRanging(Ranging):
             # Which are outermost follows from what is seen.
             used = np.arange(bar.clusters)
         all_count = bool(self.clusters) or self.skip_outer == 0
-        skip = self._skip(bar.clusters) if bar.in_even_line and not all_count else 0
+        skip = self._skip(bar.clusters) if bar.is_even_line and not all_count else 0
         centres = bar.cluster_centres_m()
         a, b = np.triu_indices(len(used), 1)
         if not all_count:
-            same = bar.sides[used[a]] == bar.sides[used[b]]
+            same = bar.lit_sides[used[a]] == bar.lit_sides[used[b]]
             a, b = a[same], b[same]
         a, b = used[a], used[b]
         apart = np.hypot(*(centres[:, None] - centres).T)
         instead = f"use '{ROLES['ranging'].default_for(bar, codebook.of_chips)}' for this layout"
-        if not (bar.alike and bar.apart):
+        if not (bar.has_equal_clusters and bar.has_distinct_centres):
             raise ConfigError(
                 f"ranging 'poc' compares images of clusters, which have to be alike and apart: {instead}"
             )
@@ -120,7 +120,7 @@ class PocRanging(Ranging):
             )
         neighbour = float(apart[apart > 0].min())
 
-        rim_px = _RIM_PX if (bar.sides & 3).any() and (bar.sides & 12).any() else 0.0
+        rim_px = _RIM_PX if (bar.lit_sides & 3).any() and (bar.lit_sides & 12).any() else 0.0
         rules = self.weight_power, self.drop_extremes, self.outlier_iqr
 
         @lru_cache(maxsize=256)

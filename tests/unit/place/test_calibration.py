@@ -90,7 +90,7 @@ def test_sites_that_are_not_exact_are_in_the_covariance() -> None:
         assert sigma.focal_mm == pytest.approx(found.sigma["focal_mm"], rel=1e-3)
         for name in CAMERA_PARAMETERS[3:]:
             assert abs(getattr(found.camera, name) - getattr(TRUE, name)) < 5 * getattr(sigma, name)
-        root = sigma.root(found.camera)
+        root = sigma.covariance_root(found.camera)
         assert root[0, 0] == pytest.approx(sigma.focal_mm * 1e3 / TRUE.pitch_um, rel=1e-3)
     assert min(spreads) > 1.2
     assert 0.2 < np.mean(squares) < stats.chi2.isf(1e-4, 8) / 8

@@ -79,7 +79,7 @@ def misses(p: Problem, at: Fit, change: Floats) -> Floats:
     seen = Attitude.of_rotation(rotation)
     names = ("pitch_deg", "roll_deg", "heading_deg")
     off_deg = np.array([getattr(p.attitude, name) - getattr(seen, name) for name in names])
-    causes = p.attitude.standing()
+    causes = p.attitude.bias_root_rad()
     spread = causes @ causes.T + np.radians(p.attitude.white_sigma_deg) ** 2 * np.eye(3)
     found.append(np.linalg.solve(np.linalg.cholesky(spread), np.radians(off_deg)))
     return np.concatenate(found)
@@ -240,7 +240,7 @@ def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
     slow = by_points @ np.diag(equations.stands) @ by_points.T
     np.testing.assert_allclose(pose.slow, slow, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(pose.standing["camera"], -spread[:3, 7:14], rtol=1e-6, atol=1e-9)
-    angles = spread[:3, :14] @ equations.angles.T @ p.angles.white @ p.attitude.standing()
+    angles = spread[:3, :14] @ equations.angles.T @ p.angles.white @ p.attitude.bias_root_rad()
     np.testing.assert_allclose(pose.standing["attitude"], angles, rtol=1e-6, atol=1e-9)
     for b in range(bars):
         own = slice(14 + 9 * b + 2, 23 + 9 * b)

@@ -212,7 +212,7 @@ def test_every_error_is_in_its_covariance() -> None:
     rng = np.random.default_rng(3)
     true, squares = np.array([3.0, -2.0, 25.0]), []
     for _ in range(400):
-        root = LENS.root(BENT)
+        root = LENS.covariance_root(BENT)
         off = root @ rng.normal(size=7)
         names = CAMERA_PARAMETERS[1:]
         values = {name: getattr(BENT, name) + v for name, v in zip(names, off[1:], strict=True)}

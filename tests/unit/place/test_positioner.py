@@ -167,7 +167,7 @@ def test_gravity_and_north_are_those_of_the_place_not_of_the_first_site() -> Non
     # The covariance turns along: its size stays, its axes are those of the track's frame.
     plain = fixes_of(positioner([LEFT]), packets_of(LEFT, 0, 6))
     here = LocalAxes.of([LEFT])
-    turn = LocalAxes.of([far]).turn_from(here)
+    turn = LocalAxes.of([far]).rotation_from(here)
     np.testing.assert_allclose(fixes[1].covariance_m2, turn @ plain[1].covariance_m2 @ turn.T, atol=1e-9)
 
 
@@ -300,10 +300,10 @@ def test_an_attitude_file(tmp_path: Path) -> None:
     path.write_text(text, encoding="utf-8-sig")
     # What the file has not are those that are said.
     track = AttitudeLog.read(path, Attitude(gravity_sigma_deg=0.7, heading_sigma_deg=3.0))
-    found = track.at(500)
+    found = track.interpolate(500)
     assert (found.pitch_deg, found.roll_deg, found.heading_deg) == pytest.approx((2, -1, 0))
     assert (found.gravity_sigma_deg, found.heading_sigma_deg) == pytest.approx((0.7, 0.3))
-    assert track.at(1001) is None
+    assert track.interpolate(1001) is None
     path.write_text("t_us,pitch_deg,roll_deg\n0,1,2\n")
     with pytest.raises(ConfigError, match="two lines or more with rising t_us"):
         AttitudeLog.read(path)

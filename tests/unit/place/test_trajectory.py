@@ -214,10 +214,10 @@ def stepped(way, velocity, heading, imu, kicked_s=np.inf, turn=0.0, kick=0.0) ->
     late, bias = (t > kicked_s)[:, None], imu * imu_sigmas(way, STRONG)
     angle = np.interp(t, way.t_s, way.turn_rad) - bias[0] * t + turn * late[:, 0]
     speed = velocity + late * kick
-    if way.push_m_s2 is None:
+    if way.acceleration_m_s2 is None:
         speed = turned(speed, angle)
     else:
-        pushed = np.stack([np.interp(t, way.t_s, c) for c in way.push_m_s2.T], 1) - bias[-3:]
+        pushed = np.stack([np.interp(t, way.t_s, c) for c in way.acceleration_m_s2.T], 1) - bias[-3:]
         rise = turned(pushed, heading + angle) * dt
         rise[-1] = 0
         speed = speed + np.cumsum(rise, 0) - rise / 2

@@ -226,7 +226,7 @@ def test_centroid_leaves_out_the_rim_of_a_panel():
     maps = image_of(PANEL, 30)
     moved = maps.copy()
     for side, axis, px in ((1, 1, -1), (2, 1, 1), (4, 2, -1), (8, 2, 1)):
-        rim = PANEL.sides & side == 0
+        rim = PANEL.lit_sides & side == 0
         assert rim.sum() == 4
         moved[rim] = np.roll(moved[rim], px, axis=axis)
     inner, every = (CentroidRanging(skip_outer=n).compile(CAMERA, PANEL, LINK.codebook) for n in (1, 0))

@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
 from evlcp_sdk.rx.straight import straighten
-from evlcp_sdk.scene.lean import BarSight
+from evlcp_sdk.scene.tilt import LineOfSight
 from evlcp_sdk.values import Curvature, Range
 
 CHIP_US = 100.0
@@ -17,7 +17,7 @@ FRAME_US = 3200.0
 PLACES = np.arange(1.0, 16) - 8
 SPACING_M = 0.06
 FOCAL_PX = 7200.0
-AHEAD = BarSight()
+AHEAD = LineOfSight()
 
 
 def bend_of(lean_deg, distance_m, noise_px, rng):
@@ -83,9 +83,9 @@ def foreshortened(along=0.0, about_deg=0.0, sigma_deg=0.7, share=0.1):
 @pytest.mark.parametrize("along", [0.0, 0.05, -0.05])
 def test_a_first_distance_stays_but_for_the_lean_that_is_known_or_likely(along, lean_deg):
     """A bar 360 px off the middle looks shorter or longer by a twentieth of its lean."""
-    sight, likely = BarSight(along), ()
+    sight, likely = LineOfSight(along), ()
     if lean_deg is not None:
-        sight = BarSight(along, sine=math.sin(math.radians(lean_deg)), sigma=math.radians(0.3))
+        sight = LineOfSight(along, tilt_sine=math.sin(math.radians(lean_deg)), tilt_sigma=math.radians(0.3))
         likely = lean_deg, 0.3, 6e-5
     _, (found,) = kept([Range(50.0, 0.02, 15)], sight)
     mean, spread = foreshortened(along, *likely)
@@ -117,7 +117,7 @@ def test_a_lean_is_found_in_the_bend(lean_deg, told_deg):
     """Also by how much it differs from what an attitude tells, to 2 degrees."""
     sight = AHEAD
     if told_deg is not None:
-        sight = BarSight(sine=math.sin(math.radians(told_deg)), sigma=math.radians(2))
+        sight = LineOfSight(tilt_sine=math.sin(math.radians(told_deg)), tilt_sigma=math.radians(2))
     how = {"start_m": 42.0, "lean_deg": lean_deg, "sight": sight}
     errors = np.stack([drive(60, 0.015, 0.04, seed, **how) for seed in range(8)])
     # A frame tells a lean to 2.5 degrees here: the first ten cannot tell a lean from none.

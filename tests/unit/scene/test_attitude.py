@@ -39,8 +39,8 @@ def pushed_enu(t: float) -> Floats:
 def test_turn_and_push_of_a_tilted_camera() -> None:
     log = moving_log()
     start, end = 0.5032, 3.2071
-    found = log.between(start * 1e6, end * 1e6)
-    assert found.gyro
+    found = log.motion_between(start * 1e6, end * 1e6)
+    assert found.has_gyro
     assert found.t_s[0] == 0
     assert found.t_s[-1] == pytest.approx(end - start)
     turned = np.radians(heading_deg(start + found.t_s) - heading_deg(start))
@@ -50,20 +50,20 @@ def test_turn_and_push_of_a_tilted_camera() -> None:
         east, north, up = pushed_enu(start + found.t_s[k])
         right, forward = np.cos(heading), np.sin(heading)
         own = [east * right - north * forward, east * forward + north * right, up]
-        np.testing.assert_allclose(found.push_m_s2[k], own, atol=2e-3)
-    assert log.between(-1.0, 1e6) is None
-    assert log.between(1e6, 5e6) is None
+        np.testing.assert_allclose(found.acceleration_m_s2[k], own, atol=2e-3)
+    assert log.motion_between(-1.0, 1e6) is None
+    assert log.motion_between(1e6, 5e6) is None
 
 
 def test_without_rates_headings_tell_and_a_long_log_is_thinned() -> None:
     t_us = np.arange(100_000) * 1e3
     heading = np.linspace(0, 720, len(t_us))
     still = np.zeros(len(t_us))
-    found = AttitudeLog(t_us, still, still, heading, still, still).between(0.0, t_us[-1])
-    assert not found.gyro
+    found = AttitudeLog(t_us, still, still, heading, still, still).motion_between(0.0, t_us[-1])
+    assert not found.has_gyro
     assert found.turn_rad[-1] == pytest.approx(np.radians(720))
     assert 2048 < len(found.t_s) < 4100
-    assert AttitudeLog(t_us, still, still, None, still, still).between(0.0, 1e6) is None
+    assert AttitudeLog(t_us, still, still, None, still, still).motion_between(0.0, 1e6) is None
 
 
 @pytest.mark.parametrize(("with_heading", "with_imu"), [(True, True), (False, True), (True, False)])
@@ -113,19 +113,19 @@ def test_angles_are_not_drawn_across_lines_that_are_lost() -> None:
     still = np.zeros(len(t_us))
     log = AttitudeLog(t_us, angle, still, angle, still, still)
     for known_us in (0.0, 48.5e3, 49e3, 200e3, 249e3):
-        at = log.at(known_us)
+        at = log.interpolate(known_us)
         assert at.pitch_deg == pytest.approx(known_us * 1e-3)
-    assert log.at(49.1e3) is None
-    assert log.at(199e3) is None
-    assert log.between(48.5e3, 49.5e3) is None
-    assert log.between(10e3, 210e3) is None
+    assert log.interpolate(49.1e3) is None
+    assert log.interpolate(199e3) is None
+    assert log.motion_between(48.5e3, 49.5e3) is None
+    assert log.motion_between(10e3, 210e3) is None
     for start_us, end_us in ((10e3, 49e3), (200e3, 249e3)):
-        swing = log.between(start_us, end_us)
+        swing = log.motion_between(start_us, end_us)
         assert swing.turn_rad[-1] == pytest.approx(np.radians((end_us - start_us) * 1e-3))
     # Lines that come late, but not by much, and logs of few lines have no gaps.
     for t_us in ([0.0, 1e3, 2e3, 9e3, 10e3], [0.0, 10e3]):
         none = np.zeros(len(t_us))
-        assert AttitudeLog(np.array(t_us), none, none, None, none, none).at(5e3) is not None
+        assert AttitudeLog(np.array(t_us), none, none, None, none, none).interpolate(5e3) is not None
 
 
 TURN_S = np.arange(0, 6, 0.01)

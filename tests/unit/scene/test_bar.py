@@ -76,17 +76,17 @@ def test_a_link_s_table_comes_back(table: dict[str, Any], tmp_path: Path) -> Non
 
 def test_sides_say_where_light_goes_on() -> None:
     # 1 above, 2 below, 4 left, 8 right.
-    assert BarLayout().sides.tolist() == [2, *[3] * 14, 1]
-    panel = BarLayout(LedGrid(6, 6, 0.02, 2, 2)).sides.reshape(3, 3)
+    assert BarLayout().lit_sides.tolist() == [2, *[3] * 14, 1]
+    panel = BarLayout(LedGrid(6, 6, 0.02, 2, 2)).lit_sides.reshape(3, 3)
     assert panel.tolist() == [[10, 14, 6], [11, 15, 7], [9, 13, 5]]
     # Clusters six times as high as wide touch above and beside.
-    assert BarLayout(LedGrid(12, 2, 0.01, 6)).sides.tolist() == [10, 6, 9, 5]
+    assert BarLayout(LedGrid(12, 2, 0.01, 6)).lit_sides.tolist() == [10, 6, 9, 5]
     # Columns half a metre apart do not; nor do LEDs of a ring, nor lamps with gaps of two LEDs.
-    assert BarLayout(LedColumns(2, 0.5, 18)).sides.tolist() == [2, 3, 1] * 2
-    assert not BarLayout(LedRing(12, 0.1)).sides.any()
+    assert BarLayout(LedColumns(2, 0.5, 18)).lit_sides.tolist() == [2, 3, 1] * 2
+    assert not BarLayout(LedRing(12, 0.1)).lit_sides.any()
     for gap_m, sides in ((0.005, [2, 3, 1]), (0.02, [0, 0, 0])):
         lamps = [[0.0, 0.01 * i + gap_m * (i // 3), 0.0, i // 3] for i in range(9)]
-        assert BarLayout.of_table({"shape": "table", "leds": lamps}).sides.tolist() == sides
+        assert BarLayout.of_table({"shape": "table", "leds": lamps}).lit_sides.tolist() == sides
 
 
 def test_even_columns_are_found_in_any_order() -> None:

@@ -14,7 +14,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
-from evlcp_sdk.scene.lean import BarSight, magnification_of, sight_of
+from evlcp_sdk.scene.tilt import LineOfSight, line_of_sight, magnification_of
 
 BENT = CameraModel(
     focal_mm=4.0, centre_x_px=650.5, centre_y_px=340.25, k1=-0.21, k2=0.06, p1=1.1e-3, p2=-7e-4, k3=-0.004
@@ -74,10 +74,10 @@ def test_a_pixel_that_no_direction_reaches_is_not_inverted() -> None:
 def test_slopes_are_the_numerical_ones(x: float, y: float, z: float) -> None:
     point = np.array([x, y, z])
     want = approx_fprime(point, BENT.project, 1e-6)
-    np.testing.assert_allclose(BENT.project_slope(point), want, atol=2e-3)
+    np.testing.assert_allclose(BENT.projection_jacobian(point), want, atol=2e-3)
     direction = point[:2] / z
     np.testing.assert_allclose(
-        BENT.distort_slope(direction), approx_fprime(direction, BENT.distort, 1e-7), atol=2e-3
+        BENT.distortion_jacobian(direction), approx_fprime(direction, BENT.distort, 1e-7), atol=2e-3
     )
 
     def image(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -87,7 +87,7 @@ def test_slopes_are_the_numerical_ones(x: float, y: float, z: float) -> None:
 
     here = np.array([BENT.focal_px, *(getattr(BENT, name) for name in CAMERA_PARAMETERS[1:])])
     slope = approx_fprime(here, image, 1e-6)
-    np.testing.assert_allclose(BENT.parameter_slope(direction), slope, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(BENT.parameter_jacobian(direction), slope, rtol=1e-4, atol=1e-3)
 
 
 def test_sigmas_and_correlations_make_the_covariance() -> None:
@@ -97,12 +97,12 @@ def test_sigmas_and_correlations_make_the_covariance() -> None:
     roots = np.sqrt(np.diag(covariance))
     sigma, rows = roots * [1e-2, 1, 1, 1e-2, 1e-2, 1e-4, 1e-4], covariance / np.outer(roots, roots)
     found = CameraSigma(*sigma.tolist(), correlation=tuple(tuple(r) for r in rows.tolist()))
-    root = found.root(BENT)
+    root = found.covariance_root(BENT)
     assert not np.triu(root, 1).any()
     sigma[0] *= BENT.focal_px / BENT.focal_mm
     np.testing.assert_allclose(root @ root.T, rows * np.outer(sigma, sigma), rtol=1e-6)
-    assert found.known
-    assert not CameraSigma().known
+    assert found.is_known
+    assert not CameraSigma().is_known
 
 
 @pytest.mark.parametrize(
@@ -143,12 +143,12 @@ PLUMB = (0.0, 0.0, -1.0)
 def test_a_plumb_bar(pitch_deg, roll_deg, east, up, axis) -> None:
     attitude = Attitude(pitch_deg, roll_deg, 0.0)
     points, depth_m, direction = seen(attitude, east, up, axis)
-    sight = sight_of(CAMERA, points, SIGMA_PX, attitude)
+    sight = line_of_sight(CAMERA, points, SIGMA_PX, attitude)
     assert not sight.askew
-    assert sight.sine == pytest.approx(-direction[2], abs=1e-12)
+    assert sight.tilt_sine == pytest.approx(-direction[2], abs=1e-12)
     # The length in the image says the depth, once it is known how much of it the lean takes.
     spacing_px = np.hypot(*(points[-1] - points[0])) / 15
-    length = foreshortening(sight.sine, sight.along, sight.across)
+    length = foreshortening(sight.tilt_sine, sight.along, sight.across)
     assert CAMERA.distance_m(0.06, spacing_px) * length == pytest.approx(depth_m, abs=1e-3)
 
 
@@ -163,19 +163,20 @@ def foreshortening(sine: float, along: float, across: float) -> float:
 def test_a_bar_that_stands_otherwise_is_askew(axis: tuple[float, float, float]) -> None:
     attitude = Attitude(4.0, 0.0)
     points, _, _ = seen(attitude, 1.0, 0.5, axis)
-    sight = sight_of(CAMERA, points, SIGMA_PX, attitude)
+    sight = line_of_sight(CAMERA, points, SIGMA_PX, attitude)
     assert sight.askew
-    assert sight.sine is None
+    assert sight.tilt_sine is None
     # An attitude that is not sure to that extent does not tell it from a plumb one.
     if abs(axis[0]) < 0.1:
-        assert sight_of(CAMERA, points, SIGMA_PX, Attitude(4.0, 0.0, gravity_sigma_deg=1.5)).sine is not None
+        unsure = Attitude(4.0, 0.0, gravity_sigma_deg=1.5)
+        assert line_of_sight(CAMERA, points, SIGMA_PX, unsure).tilt_sine is not None
 
 
 def test_the_sigma_is_that_of_gravity_and_of_plumb_bars() -> None:
     points, _, _ = seen(Attitude(30.0, 0.0, 0.0), 0.0, 29.0, PLUMB)
-    sight = sight_of(CAMERA, points, SIGMA_PX, Attitude(30.0, 0.0, gravity_sigma_deg=0.2))
-    assert sight.sine == pytest.approx(0.5)
-    assert sight.sigma == pytest.approx(math.radians(math.hypot(0.2, 0.1)) * math.cos(math.radians(30)))
+    sight = line_of_sight(CAMERA, points, SIGMA_PX, Attitude(30.0, 0.0, gravity_sigma_deg=0.2))
+    assert sight.tilt_sine == pytest.approx(0.5)
+    assert sight.tilt_sigma == pytest.approx(math.radians(math.hypot(0.2, 0.1)) * math.cos(math.radians(30)))
 
 
 @pytest.mark.parametrize("corner", list(product((-600.0, 600.0), (-320.0, 320.0))))
@@ -194,12 +195,12 @@ def test_distances_and_bends_of_a_distorted_bar_are_those_of_a_pinhole(corner, l
     shown = (boundaries - clusters.mean(0)) @ axis / np.hypot(*axis)
     spacing_px, first_px = np.polyfit(place, shown, 1)
     off_px = shown - spacing_px * place - first_px
-    sight = sight_of(camera, clusters, SIGMA_PX)
+    sight = line_of_sight(camera, clusters, SIGMA_PX)
     naive_m = camera.distance_m(0.06, spacing_px)
     assert abs(naive_m / depth_m - 1) > 4e-4
     assert naive_m * sight.magnification == pytest.approx(depth_m, rel=6e-5)
     bent, _, _ = np.polyfit(place, off_px / (spacing_px * 0.06 / depth_m), 2)
-    assert sight.bow == pytest.approx(bent, abs=3e-4 + 0.03 * abs(bent))
+    assert sight.distortion_tilt == pytest.approx(bent, abs=3e-4 + 0.03 * abs(bent))
     assert magnification_of(camera, clusters) == pytest.approx(sight.magnification, rel=1e-4)
 
 
@@ -207,11 +208,11 @@ def test_a_part_of_a_bar_has_a_sight_and_a_point_has_none() -> None:
     attitude = Attitude(4.0, 0.0)
     points, _, direction = seen(attitude, 1.0, 3.0, PLUMB)
     points[[0, 1, 2, 9]] = np.nan
-    assert sight_of(CAMERA, points, SIGMA_PX, attitude).sine == pytest.approx(-direction[2])
-    unknown = sight_of(CAMERA, points, SIGMA_PX)
+    assert line_of_sight(CAMERA, points, SIGMA_PX, attitude).tilt_sine == pytest.approx(-direction[2])
+    unknown = line_of_sight(CAMERA, points, SIGMA_PX)
     # 3 m above and 4 degrees up: below the middle, a metre to the right.
     assert unknown.along == pytest.approx(math.tan(math.radians(4)) - 3 / 50, abs=2e-3)
     assert abs(unknown.across) == pytest.approx(1 / 50, abs=1e-3)
-    assert (unknown.sine, unknown.askew) == (None, False)
+    assert (unknown.tilt_sine, unknown.askew) == (None, False)
     points[4:] = np.nan
-    assert sight_of(CAMERA, points, SIGMA_PX, attitude) == BarSight()
+    assert line_of_sight(CAMERA, points, SIGMA_PX, attitude) == LineOfSight()

@@ -49,9 +49,9 @@ def test_clusters_stand_where_the_ellipsoid_says(lat, lon, height, heading, tilt
 def test_vectors_turn_between_frames(lat: float, lon: float, dlat: float, dlon: float) -> None:
     one, two = LocalAxes(lat, lon, 10.0), LocalAxes(lat + dlat, lon + dlon, 40.0)
     want = enu_axes(one.latitude_deg, one.longitude_deg) @ enu_axes(two.latitude_deg, two.longitude_deg).T
-    np.testing.assert_allclose(one.turn_from(two), want, atol=1e-12)
+    np.testing.assert_allclose(one.rotation_from(two), want, atol=1e-12)
     step = one.to_enu(*two.to_geodetic([3.0, -4.0, 5.0])) - one.to_enu(*two.to_geodetic([0.0, 0.0, 0.0]))
-    np.testing.assert_allclose(one.turn_from(two) @ [3.0, -4.0, 5.0], step, atol=1e-6)
+    np.testing.assert_allclose(one.rotation_from(two) @ [3.0, -4.0, 5.0], step, atol=1e-6)
 
 
 def test_a_site_file(tmp_path: Path) -> None:
@@ -93,9 +93,9 @@ def test_which_site_a_transmitter_stands_at() -> None:
     assert site_of_transmitter(both, 1) is numbered
     assert site_of_transmitter(both, 1, transmitter_id=7) is plain
     assert site_of_transmitter(both, 0, transmitter_id=8) is None
-    assert site_of_transmitter(both, 0, alone=True) is None
-    assert site_of_transmitter([plain], 5, alone=True) is plain
+    assert site_of_transmitter(both, 0, is_only=True) is None
+    assert site_of_transmitter([plain], 5, is_only=True) is plain
     assert site_of_transmitter([plain], 5) is None
-    assert site_of_transmitter([numbered], 0, alone=True) is None
+    assert site_of_transmitter([numbered], 0, is_only=True) is None
     with pytest.raises(ConfigError, match="one bar or more"):
         LocalAxes.of([])
