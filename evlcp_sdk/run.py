@@ -24,9 +24,9 @@ from evlcp_sdk.errors import (
 )
 from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
-from evlcp_sdk.io.describe import check_sensor, recording_table
+from evlcp_sdk.io.describe import check_sensor, summarize_source
+from evlcp_sdk.io.interruptible import open_until_stopped, stream_until_stopped
 from evlcp_sdk.io.open import STDIN, is_recording
-from evlcp_sdk.io.patience import open_until, pieces_until
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.several import load_links, named_links, placing_links
 from evlcp_sdk.plugin.registry import Registry
@@ -96,7 +96,7 @@ def receive(
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
     with ExitStack() as stack:
-        opened = stack.enter_context(open_until(source, registry, never))
+        opened = stack.enter_context(open_until_stopped(source, registry, never))
         pulses = _check_source(opened, _name_of(source, opened), links, clock_zero)
         receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero, workers=workers)
         stack.pop_all()
@@ -129,7 +129,7 @@ def _check_source(
 
 def _events_of(source: EventSource, pulses: PulseClock | None, stopped: Stopped = never) -> Iterator[Events]:
     """The events of a source; its triggers go to the pulses before the events that came with them."""
-    for events, triggers in pieces_until(source, stopped):
+    for events, triggers in stream_until_stopped(source, stopped):
         if pulses is not None:
             pulses.add(triggers, time.time(), span_us(events, triggers)[1])
         if len(events):
@@ -262,7 +262,7 @@ def receive_to_folder(
     """
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
-    with open_until(source, registry, stopped) as opened:
+    with open_until_stopped(source, registry, stopped) as opened:
         url = _name_of(source, opened)
         pulses = _check_source(opened, url, links, clock_zero)
         with ResultWriter(
@@ -327,7 +327,7 @@ def live(
         waits = not isinstance(source, EventSource) and is_recording(source)
         if warm and not waits:
             warm_up(links, positions=plan is not None)
-        opened = open_until(source, registry, stopped)
+        opened = open_until_stopped(source, registry, stopped)
         if not opened.live and opened.size_bytes is not None:
             opened = ReplaySource(opened)
         with opened:
@@ -396,11 +396,11 @@ def convert(
     registry = Registry.load() if registry is None else registry
     error: InputError | None = None
     counts = {"events": 0, "triggers": 0}
-    with open_until(source, registry, stopped) as opened:
+    with open_until_stopped(source, registry, stopped) as opened:
         width, height = size or (opened.width, opened.height)
         with open_writer(out, width, height, format, registry=registry) as writer:
             try:
-                for events, triggers in pieces_until(opened, stopped):
+                for events, triggers in stream_until_stopped(opened, stopped):
                     writer.write(events, triggers)
                     counts["events"] += len(events)
                     counts["triggers"] += len(triggers)
@@ -491,7 +491,7 @@ def _tables_of(
     source: EventSource, url: str, watch: Stopwatch, first_us: int | None, last_us: int | None
 ) -> dict[str, dict[str, Any]]:
     """What the summary says of a recording, and of how it was worked off."""
-    recording = recording_table(source, url, first_us, last_us)
+    recording = summarize_source(source, url, first_us, last_us)
     recording |= {"guessed": source.guessed, "step_us": source.step_us}
     duration_s = recording["duration_s"]
     pace = round(times_real_time(duration_s, watch.processor_s), 3) if duration_s else None

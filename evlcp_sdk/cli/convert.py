@@ -38,14 +38,14 @@ def convert(
     A camera, until Ctrl-C:   [bold]evlcp convert camera: -o REC.raw[/]
     """
     from evlcp_sdk.errors import InputError, UnpluggedError
-    from evlcp_sdk.io.urls import sides
+    from evlcp_sdk.io.urls import parse_size
     from evlcp_sdk.run import convert as run_convert
     from evlcp_sdk.signals import stop_on_request
 
     given = None
     if size is not None:
         try:
-            given = sides(size)
+            given = parse_size(size)
         except ValueError as fault:
             raise typer.BadParameter(f"{size!r}: expected {fault}", param_hint="--size") from fault
     with stop_on_request() as stopped, bytes_bar(Path(url).name) as advance:

@@ -17,11 +17,11 @@ def info(
 
     Reads it once from front to back and decodes no light: [bold]evlcp info REC.raw[/]
     """
-    from evlcp_sdk.io.describe import describe
+    from evlcp_sdk.io.describe import describe_source
     from evlcp_sdk.io.open import STDIN, open_source
 
     with open_source(recording) as source:
-        table = describe(source, str(source.path) if recording == STDIN else recording)
+        table = describe_source(source, str(source.path) if recording == STDIN else recording)
     if as_json:
         print_json(table, 2)
     else:

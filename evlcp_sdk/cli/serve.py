@@ -31,7 +31,7 @@ def serve(
 
     A recording begins when somebody has connected. Nothing is encrypted, and whoever can connect gets all.
     """
-    from evlcp_sdk.io.patience import open_until
+    from evlcp_sdk.io.interruptible import open_until_stopped
     from evlcp_sdk.io.replay import ReplaySource
     from evlcp_sdk.live.sender import Sender
     from evlcp_sdk.plugin.registry import Registry
@@ -40,7 +40,7 @@ def serve(
     address = None if tcp is None else _address(tcp)
     if address is None and unix is None:
         raise typer.BadParameter("give --tcp PORT, or --unix PATH", param_hint="--tcp")
-    with stop_on_request() as stopped, open_until(url, Registry.load(), stopped) as opened:
+    with stop_on_request() as stopped, open_until_stopped(url, Registry.load(), stopped) as opened:
         recorded = not opened.live or isinstance(opened, ReplaySource)
         source = opened if opened.live else ReplaySource(opened)
         with Sender(source, address, unix) as sender:

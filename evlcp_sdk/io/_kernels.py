@@ -1,8 +1,8 @@
-"""Every kernel of `evlcp_sdk.io`, what the words of a RAW file are, and what a decoder remembers and counts.
+"""Every kernel of `evlcp_sdk.io`; the words of a RAW file, the state of a decoder, and what it counts.
 
 Indices that advance in a loop are `uintp`: numba then leaves out its test for negative indices. A word has
 `size` bytes, and its type in the top 4 bits, which is 8 for TIME_HIGH in every encoding; `at` is the byte
-offset of words[0]; where they are `final` nothing comes behind, else -1 says that more are needed to tell.
+offset of words[0]. If words are not `final`, a result of -1 asks for more of them.
 """
 
 from typing import Any, Final
@@ -30,35 +30,35 @@ EVT2_TIME_HIGH: Final = 0x8
 EVT2_EXT_TRIGGER: Final = 0xA
 EVT2_TYPES: Final = 0b1100_0101_0000_0011
 
-# Slots of a decoder's state, int64. All of it; nothing else passes from one call to the next.
+# Slots of a decoder's whole state, int64.
 BASE: Final = 0  # EVT3: 2^24 a rollover; EVT2: 2^34; UNKNOWN_TIME before the first TIME_HIGH, us
-LAST: Final = 1  # time of the last event or trigger given out, us
+LAST: Final = 1  # time of the last event or trigger decoded, us
 PACKED: Final = 2  # EVT3 only, as all to VECTOR_AT: the last event with its time and row, see below
 COLUMN: Final = 3  # where the next vector word starts, or UNKNOWN_COLUMN or more
 POLARITY: Final = 4  # of the last VECT_BASE_X
 VECTOR_LEFT: Final = 5  # vector words still to come after the last VECT_BASE_X
 VECTOR_AT: Final = 6  # byte offset of that VECT_BASE_X
-DOUBT: Final = 7  # both: 1 behind a TIME_HIGH that is not believed
-LEVEL: Final = 8  # both: words before this byte offset are known not to stand askew
-HIGH: Final = 9  # both: the last TIME_HIGH that is believed
+UNCONFIRMED: Final = 7  # both: 1 after a TIME_HIGH that is not confirmed
+ALIGNED_UNTIL: Final = 8  # both: words before this byte offset are known to be aligned
+HIGH: Final = 9  # both: the last confirmed TIME_HIGH
 STATE_SLOTS: Final = 10
 
-# A step of TIME_HIGH by more than one is believed unless most of the next `FOLLOWERS` in so many bytes are
-# still on the clock before it. One back by up to `NEAR_US` is an early word, not another clock.
+# A step of TIME_HIGH by more than one is confirmed unless most of the next `FOLLOWERS` in so many bytes are
+# still on the clock before it. A step back by up to `NEAR_US` is an early word, not another clock.
 FOLLOWERS: Final = 3
-LOOK_BYTES: Final = 1 << 18
+LOOKAHEAD_BYTES: Final = 1 << 18
 NEAR_US: Final = 10_000
 
-# Where bytes are missing, all words behind stand askew. Of words as they were sent none is of a reserved
-# type, of others a third: so many words tell, if so many of them are reserved, and an eighth as many where
-# others are taken for their starts; and if times then follow one another by less than `STRIDE_US`. What is
-# found level is not looked at again for `LEVEL_WORDS`, where there is doubt for `SOON_WORDS`; but at any
-# TIME_HIGH that does not go on by one.
-TELLING_WORDS: Final = 256
-TELLING_RESERVED: Final = 8
-STRIDE_US: Final = 1_000_000
-LEVEL_WORDS: Final = 64
-SOON_WORDS: Final = 8
+# After missing bytes all words are misaligned. Of aligned words none is of a reserved type, of others a
+# third. Of `ALIGNMENT_WORDS` at least `ALIGNMENT_RESERVED` have to be reserved, eight times as many as from
+# another first byte on, from which times have to step by less than `MOST_STEP_US`. Aligned words are checked
+# again after `ALIGNED_WORDS`, uncertain ones after `RECHECK_WORDS`, and at any TIME_HIGH that does not step
+# by one.
+ALIGNMENT_WORDS: Final = 256
+ALIGNMENT_RESERVED: Final = 8
+MOST_STEP_US: Final = 1_000_000
+ALIGNED_WORDS: Final = 64
+RECHECK_WORDS: Final = 8
 
 UNKNOWN_TIME: Final = -1
 UNKNOWN_ROW: Final = 0x8000
@@ -126,51 +126,51 @@ BIT_COUNT = (np.arange(256)[:, None] >> np.arange(8) & 1).sum(axis=1).astype(np.
 
 
 @njit
-def _note(tally: Column, row: Integer, at: Integer) -> None:
+def _count_loss(tally: Column, row: Integer, at: Integer) -> None:
     if tally[row, 0] == 0:
         tally[row, 1] = at
     tally[row, 0] += 1
 
 
 @njit
-def _judge_time(
+def _confirm_time(
     words: Column, i: Integer, size: Integer, before: Integer, low_bits: Integer, final: Any
 ) -> Integer:
-    """Whether words[i], a TIME_HIGH above `low_bits`, is believed after `before`, by those that follow it.
+    """Check words[i], a TIME_HIGH above `low_bits` that comes after `before`, by those that follow it.
 
-    Returns 2 early by little, 1 believed, 0 not, -1.
+    Returns 2 for slightly early, 1 for confirmed, 0 for not, -1.
     """
     shift = 8 * size - 4
     ring = (int64(1) << shift) - 1
     high = int64(words[i]) & ring
-    ahead = (high - before) & ring
-    if ahead <= 1:
+    step = (high - before) & ring
+    if step <= 1:
         return int64(1)
-    if (ring + 1 - ahead) << low_bits <= NEAR_US:
+    if (ring + 1 - step) << low_bits <= NEAR_US:
         return int64(2)
-    # The next but one is past a short step, believed or not.
-    most = FOLLOWERS if ahead > FOLLOWERS else 1
+    # After a short step the next but one is past it in any case.
+    most = FOLLOWERS if step > FOLLOWERS else 1
     agree = against = 0
-    stop = min(i + 1 + LOOK_BYTES // size, len(words))
+    stop = min(i + 1 + LOOKAHEAD_BYTES // size, len(words))
     for k in range(i + 1, stop):
         w = int64(words[k])
         if w >> shift != 8:
             continue
-        if ((w & ring) - before) & ring < ahead:
+        if ((w & ring) - before) & ring < step:
             against += 1
         else:
             agree += 1
         if 2 * max(agree, against) > most:
             break
     else:
-        if not final and i + 1 + LOOK_BYTES // size > len(words):
+        if not final and i + 1 + LOOKAHEAD_BYTES // size > len(words):
             return int64(-1)
     return int64(agree >= against)
 
 
 @njit
-def _shifted(words: Column, i: Integer, size: Integer, shift: Integer) -> Integer:
-    """The word that starts `shift` bytes behind the start of words[i]."""
+def _read_word_at(words: Column, i: Integer, size: Integer, shift: Integer) -> Integer:
+    """Return the word that starts `shift` bytes after the start of words[i]."""
     word = int64(words[i]) >> (8 * shift)
     if shift:
         word |= (int64(words[i + 1]) << (8 * (size - shift))) & ((int64(1) << (8 * size)) - 1)
@@ -178,7 +178,7 @@ def _shifted(words: Column, i: Integer, size: Integer, shift: Integer) -> Intege
 
 
 @njit
-def _unlevel(
+def _find_misalignment(
     words: Column,
     i: Integer,
     at: Integer,
@@ -188,34 +188,34 @@ def _unlevel(
     state: Column,
     final: Any,
 ) -> Integer:
-    """How many bytes behind words[i], an odd one, words of `types` start that agree, where these do not.
+    """Return how many bytes after words[i], an unexpected one, aligned words of `types` start.
 
-    Returns 0, too, where these words stand as they should, or nothing tells; or -1.
+    Returns 0 if the words are aligned, or it cannot be told; or -1.
     """
-    if at + size * i < state[LEVEL] and int64(words[i]) >> (8 * size - 4) != 8:
+    if at + size * i < state[ALIGNED_UNTIL] and int64(words[i]) >> (8 * size - 4) != 8:
         return int64(0)
-    if i + TELLING_WORDS >= len(words):
+    if i + ALIGNMENT_WORDS >= len(words):
         return int64(0) if final else int64(-1)
     top = 8 * size - 4
-    shift, fewest, here = int64(0), int64(TELLING_WORDS), int64(0)
+    shift, fewest, here = int64(0), int64(ALIGNMENT_WORDS), int64(0)
     for s in range(size):
         reserved = int64(0)
-        for k in range(i, i + TELLING_WORDS):
-            reserved += 1 - ((types >> (_shifted(words, k, size, s) >> top)) & 1)
+        for k in range(i, i + ALIGNMENT_WORDS):
+            reserved += 1 - ((types >> (_read_word_at(words, k, size, s) >> top)) & 1)
         if s == 0:
             here = reserved
         elif reserved < fewest:
             shift, fewest = int64(s), reserved
-    if here >= TELLING_RESERVED and 8 * fewest < here:
+    if here >= ALIGNMENT_RESERVED and 8 * fewest < here:
         ring = (int64(1) << top) - 1
         before = int64(-1)
-        stop = i + LOOK_BYTES // size
+        stop = i + LOOKAHEAD_BYTES // size
         for k in range(i, min(stop, len(words) - 1)):
-            word = _shifted(words, k, size, shift)
+            word = _read_word_at(words, k, size, shift)
             if word >> top != 8:
                 continue
             if before >= 0:
-                if ((word - before) & ring) << low_bits <= STRIDE_US:
+                if ((word - before) & ring) << low_bits <= MOST_STEP_US:
                     return shift
                 break
             before = word & ring
@@ -223,8 +223,8 @@ def _unlevel(
             if stop <= len(words) - 1 or final:
                 return shift
             return int64(-1)
-    # The first of them may be level, and bytes be missing soon.
-    state[LEVEL] = at + size * (i + (SOON_WORDS if here >= TELLING_RESERVED else LEVEL_WORDS))
+    # The first words may be aligned, and bytes be missing soon.
+    state[ALIGNED_UNTIL] = at + size * (i + (RECHECK_WORDS if here >= ALIGNMENT_RESERVED else ALIGNED_WORDS))
     return int64(0)
 
 
@@ -239,21 +239,21 @@ def _pack_evt3(
     packed: Column,
     first: Integer,
 ) -> tuple[Integer, Integer]:
-    """Decode words start..stop to packed events, unchecked, up to the first that is not of the sensor's.
+    """Decode words start..stop to packed events, unchecked, while they are events or times below TIME_HIGH.
 
-    Those are all but events and times that go on below the last TIME_HIGH, if that is believed. It stops,
-    too, where `packed`, filled from `first` on, may have no room for another word's events. What is written
-    behind the last event means nothing. Returns where it stopped and where the events end.
+    A TIME_HIGH may only repeat the last one, if that is confirmed. Decoding stops also where `packed`, filled
+    from `first` on, may have no room for another word's events; after the last one it has garbage. Returns
+    where decoding stopped and where the events end.
     """
     event, column, polarity = state[PACKED], state[COLUMN], state[POLARITY]
-    high = int64(-1) if state[DOUBT] else state[HIGH]
+    high = int64(-1) if state[UNCONFIRMED] else state[HIGH]
     left, vector_at = state[VECTOR_LEFT], state[VECTOR_AT]
     i, end, n, room = uintp(start), uintp(stop), uintp(first), uintp(len(packed))
     odd_until = i
     while i < end and n + uintp(BURST) <= room:
         if i >= odd_until and i + RUN_WORDS <= end and n + RUN_WORDS <= room:
-            # Which of the three it is cannot be predicted, so nothing branches on it: each is put in the
-            # packed event and writes that, and only an ADDR_X moves on.
+            # Which of the three types comes cannot be predicted, so nothing branches on it: each word changes
+            # the packed event and writes it, and only an ADDR_X moves on.
             odd = uint16(0)
             for k in range(RUN_WORDS):
                 w = words[i + k]
@@ -277,7 +277,7 @@ def _pack_evt3(
             n += uintp(EVENTS[kind])
         elif kind == EVT3_VECT_BASE_X:
             if left:
-                _note(tally, int64(VECTOR_CUT), vector_at)
+                _count_loss(tally, int64(VECTOR_CUT), vector_at)
             column = w & 0x7FF
             polarity = (w >> 11) & 1
             left = 3
@@ -290,7 +290,7 @@ def _pack_evt3(
                 and words[i + ONE + ONE] >> 12 == EVT3_VECT_12
                 and words[i + ONE + ONE + ONE] >> 12 == EVT3_VECT_8
             ):
-                # A whole vector, a byte of it at a time: eight events are written, those that are move on.
+                # A whole vector, a byte at a time: eight events are written, only set bits move on.
                 mask = int64(words[i + ONE]) & 0xFFF
                 mask |= (int64(words[i + ONE + ONE]) & 0xFFF) << 12
                 mask |= (int64(words[i + ONE + ONE + ONE]) & 0xFF) << 24
@@ -330,7 +330,7 @@ def _pack_evt3(
 def _unpack_evt3(
     base: Integer, events: EventColumns, part: tuple[Integer, Integer], size_px: Any, last: Integer
 ) -> Any:
-    """Spread the packed events of a part of their times over the columns; TIME_LOW counts from `base`.
+    """Unpack a part of the events, packed in their column of times; TIME_LOW counts from `base`.
 
     Returns whether all of them are on the sensor and none is earlier than the one before.
     """
@@ -343,7 +343,7 @@ def _unpack_evt3(
         t[k] = origin + (e >> PACKED_LOW)
         y[k] = uint16(e >> PACKED_ROW) & uint16(0x87FF)
         x[k] = uint16(e)
-    # Loops that are short and of small numbers become vector instructions.
+    # Short loops over small numbers become vector instructions.
     for k in range(start, end):
         w = x[k] ^ uint16(EVT3_ADDR_X << PACKED_CARRY)
         p[k] = (w >> PACKED_POLARITY) & 1
@@ -355,13 +355,13 @@ def _unpack_evt3(
         bottom = max(bottom, y[k])
     back = t[start] - last if start < end else int64(0)
     for k in range(start + ONE, end):
-        # Its sign is set by any step back.
+        # Any step back sets the sign.
         back |= t[k] - t[k - ONE]
     return (right < width and bottom < height and back >= 0) or start == end
 
 
 @njit
-def _sift(
+def _drop_invalid(
     words: Column,
     word: Integer,
     at: Integer,
@@ -371,7 +371,7 @@ def _sift(
     last: Integer,
     tally: Column,
 ) -> Integer:
-    """Close up a part of the events (from words[word] on) over those to drop; return the new end."""
+    """Drop and count invalid events of a part, which starts at words[word]; return the new end."""
     t, x, y, p = events
     width, height = size_px
     start, stop = part
@@ -392,14 +392,14 @@ def _sift(
             continue
         first = at
         if tally[row, 0] == 0:
-            first += 2 * _word_of_event(words, word, k - start)
-        _note(tally, int64(row), int64(first))
+            first += 2 * _find_event_word(words, word, k - start)
+        _count_loss(tally, int64(row), int64(first))
     return n
 
 
 @njit
-def _word_of_event(words: Column, word: Integer, event: Integer) -> Integer:
-    """Return the index of the word that brings an event, counted from words[word] on."""
+def _find_event_word(words: Column, word: Integer, event: Integer) -> Integer:
+    """Return the index of the word of the `event`-th event from words[word] on."""
     while True:
         w = int64(words[word])
         kind = w >> 12
@@ -419,33 +419,33 @@ def _word_of_event(words: Column, word: Integer, event: Integer) -> Integer:
 
 
 @njit
-def _take_time(
+def _advance_time(
     words: Column, i: Integer, at: Integer, size: Integer, state: Column, tally: Column, final: Any
 ) -> Integer:
-    """Take words[i], a TIME_HIGH, into the state, if those that follow it agree.
+    """Advance the clock by words[i], a TIME_HIGH, if those that follow it confirm it.
 
-    Returns 0; how many bytes behind it words start that agree with one another, where these do not; or -1.
+    Returns 0; or how many bytes after it aligned words start, if these are not; or -1.
     """
     low_bits, types = (12, EVT3_TYPES) if size == 2 else (6, EVT2_TYPES)
     ring = (int64(1) << (8 * size - 4)) - 1
     high, before, here = int64(words[i]) & ring, state[HIGH], at + size * i
-    ahead = (high - before) & ring
-    if ahead > 1:
-        askew = _unlevel(words, i, at, size, types, low_bits, state, final)
+    step = (high - before) & ring
+    if step > 1:
+        askew = _find_misalignment(words, i, at, size, types, low_bits, state, final)
         if askew:
             return askew
-    verdict = _judge_time(words, i, size, before, low_bits, final)
+    verdict = _confirm_time(words, i, size, before, low_bits, final)
     if verdict < 0:
         return int64(-1)
-    state[DOUBT] = int64(verdict == 0)
+    state[UNCONFIRMED] = int64(verdict == 0)
     if verdict != 1:
-        _note(tally, int64(TIME_GLITCH), here)
+        _count_loss(tally, int64(TIME_GLITCH), here)
     if verdict == 1 and high < before:
-        _note(tally, int64(ROLLOVERS), here)
+        _count_loss(tally, int64(ROLLOVERS), here)
         state[BASE] += (ring + 1) << low_bits
-    if verdict == 1 and ahead > 1 and size == 2:
-        # An EVT2 word brings its own time, so that there is none without events.
-        _note(tally, int64(TIME_GAPS), here)
+    if verdict == 1 and step > 1 and size == 2:
+        # EVT2 needs no TIME_HIGH without events.
+        _count_loss(tally, int64(TIME_GAPS), here)
     if verdict == 2 and high > before:
         state[BASE] -= (ring + 1) << low_bits
     if verdict:
@@ -468,18 +468,17 @@ def decode_evt3(
 
     Args:
         words: uint16 (k,).
-        place: Byte offset of words[0] in the file, and whether nothing comes behind these words. Else it may
-            stop before a TIME_HIGH that what follows has to confirm, within `LOOK_BYTES`.
+        place: Byte offset of words[0] in the file, and whether these are the last words. If not, decoding may
+            stop before a TIME_HIGH that the next `LOOKAHEAD_BYTES` have to confirm.
         size_px: Columns and rows of the sensor; events beyond are dropped and counted.
-        state: int64 (STATE_SLOTS,), carried from call to call.
+        state: int64 (STATE_SLOTS,), passed from call to call.
         tally: int64 (TALLY_ROWS, 2), added to.
         events: Columns to fill, of 12 or more.
         triggers: Columns to fill.
         filled: Events and triggers already in the columns.
 
     Returns:
-        Words used, events and triggers now in the columns, and how many bytes behind these words the next
-        one starts.
+        Words used, events and triggers now in the columns, and how many bytes to skip to aligned words.
     """
     at, final = place
     t, trigger_t, channel, value = events[0], triggers[0], triggers[1], triggers[2]
@@ -487,7 +486,7 @@ def decode_evt3(
     i = 0
     if state[BASE] < 0:
         while i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
-            _note(tally, int64(BEFORE_TIME), at + 2 * i)
+            _count_loss(tally, int64(BEFORE_TIME), at + 2 * i)
             i += 1
         if i < len(words):
             state[BASE] = 0
@@ -500,14 +499,14 @@ def decode_evt3(
         i, n = _pack_evt3(words, start, stop, at, state, tally, t, n)
         is_full = n > len(t) - BURST
         base = state[BASE] + (state[HIGH] << 12)
-        if state[DOUBT]:
-            # No time is known of these.
+        if state[UNCONFIRMED]:
+            # These events have no time.
             if n > first and tally[TIME_DOUBTFUL, 0] == 0:
-                tally[TIME_DOUBTFUL, 1] = at + 2 * _word_of_event(words, start, int64(0))
+                tally[TIME_DOUBTFUL, 1] = at + 2 * _find_event_word(words, start, int64(0))
             tally[TIME_DOUBTFUL, 0] += n - first
             n = first
         elif not _unpack_evt3(base, events, (first, n), size_px, state[LAST]):
-            n = _sift(words, start, at, events, (first, n), size_px, state[LAST], tally)
+            n = _drop_invalid(words, start, at, events, (first, n), size_px, state[LAST], tally)
         if n > first:
             state[LAST] = t[n - 1]
         if i == stop or is_full:
@@ -516,28 +515,28 @@ def decode_evt3(
         kind = w >> 12
         if kind == EVT3_TIME_HIGH:
             before = state[HIGH]
-            askew = _take_time(words, i, at, int64(2), state, tally, final)
+            askew = _advance_time(words, i, at, int64(2), state, tally, final)
             if askew:
                 break
             if state[HIGH] != before:
                 state[PACKED] = (state[PACKED] & KEEP[EVT3_TIME_LOW]) | PACKED_TIME << PACKED_LOW
         elif kind == EVT3_EXT_TRIGGER:
             clock = base - PACKED_TIME + (state[PACKED] >> PACKED_LOW)
-            if state[DOUBT]:
-                _note(tally, int64(TIME_DOUBTFUL), at + 2 * i)
+            if state[UNCONFIRMED]:
+                _count_loss(tally, int64(TIME_DOUBTFUL), at + 2 * i)
             elif clock < state[LAST]:
-                _note(tally, int64(TIME_BACKWARD), at + 2 * i)
+                _count_loss(tally, int64(TIME_BACKWARD), at + 2 * i)
             else:
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0xF, w & 1
                 state[LAST] = clock
                 m += 1
         elif (EVT3_TYPES >> kind) & 1:
-            _note(tally, int64(OTHER_WORDS), at + 2 * i)
+            _count_loss(tally, int64(OTHER_WORDS), at + 2 * i)
         else:
-            askew = _unlevel(words, i, at, int64(2), int64(EVT3_TYPES), int64(12), state, final)
+            askew = _find_misalignment(words, i, at, int64(2), int64(EVT3_TYPES), int64(12), state, final)
             if askew:
                 break
-            _note(tally, int64(RESERVED), at + 2 * i)
+            _count_loss(tally, int64(RESERVED), at + 2 * i)
         i += 1
     return i, n, m, max(askew, int64(0))
 
@@ -559,7 +558,7 @@ def decode_evt2(
     t, x, y, p = events
     trigger_t, channel, value = triggers
     n, m = filled
-    base, last, doubt = state[BASE] + (state[HIGH] << 6), state[LAST], state[DOUBT]
+    base, last, unconfirmed = state[BASE] + (state[HIGH] << 6), state[LAST], state[UNCONFIRMED]
     askew = int64(0)
     i = 0
     while i < len(words) and n < len(t) and m < len(trigger_t):
@@ -573,19 +572,19 @@ def decode_evt2(
             if state[BASE] < 0:
                 state[BASE], state[HIGH] = 0, w & 0xFFFFFFF
             else:
-                askew = _take_time(words, i, at, int64(4), state, tally, final)
+                askew = _advance_time(words, i, at, int64(4), state, tally, final)
                 if askew:
                     break
-            base, doubt = state[BASE] + (state[HIGH] << 6), state[DOUBT]
+            base, unconfirmed = state[BASE] + (state[HIGH] << 6), state[UNCONFIRMED]
         elif state[BASE] < 0:
-            _note(tally, int64(BEFORE_TIME), here)
+            _count_loss(tally, int64(BEFORE_TIME), here)
         elif kind <= EVT2_CD_ON or kind == EVT2_EXT_TRIGGER:
-            if doubt:
-                _note(tally, int64(TIME_DOUBTFUL), here)
+            if unconfirmed:
+                _count_loss(tally, int64(TIME_DOUBTFUL), here)
             elif kind <= EVT2_CD_ON and (column >= width or row >= height):
-                _note(tally, int64(OUTSIDE_SENSOR), here)
+                _count_loss(tally, int64(OUTSIDE_SENSOR), here)
             elif clock < last:
-                _note(tally, int64(TIME_BACKWARD), here)
+                _count_loss(tally, int64(TIME_BACKWARD), here)
             elif kind <= EVT2_CD_ON:
                 t[n], x[n], y[n], p[n] = clock, column, row, kind
                 last = clock
@@ -595,12 +594,12 @@ def decode_evt2(
                 last = clock
                 m += 1
         elif (EVT2_TYPES >> kind) & 1:
-            _note(tally, int64(OTHER_WORDS), here)
+            _count_loss(tally, int64(OTHER_WORDS), here)
         else:
-            askew = _unlevel(words, i, at, int64(4), int64(EVT2_TYPES), int64(6), state, final)
+            askew = _find_misalignment(words, i, at, int64(4), int64(EVT2_TYPES), int64(6), state, final)
             if askew:
                 break
-            _note(tally, int64(RESERVED), here)
+            _count_loss(tally, int64(RESERVED), here)
         i += 1
     state[LAST] = last
     return i, n, m, max(askew, int64(0))
@@ -619,7 +618,7 @@ def encode_evt3(
 
     Args:
         words: uint16 (k,) to fill; k >= 4.
-        state: int64 (3,), carried from call to call: the number of the last TIME_HIGH, the last TIME_LOW
+        state: int64 (3,), passed from call to call: the number of the last TIME_HIGH, the last TIME_LOW
             and the last ADDR_Y, each -1 if there was none.
         events: Their columns, sorted by time.
         i: First event to encode.

@@ -1,4 +1,4 @@
-"""Hold back what no receiver may see, for the formats that are not decoded word by word."""
+"""Drop what no receiver may see, for the formats that are not decoded word by word."""
 
 from typing import Final
 
@@ -8,7 +8,7 @@ from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.values import Events
 
-MEANINGS: Final = {
+_LOSSES: Final = {
     "outside_sensor": ("dropped_off_sensor", "events outside the sensor; dropped"),
     "time_backward": ("dropped_time_backward", "events earlier than the one before; dropped"),
     "time_doubtful": (
@@ -19,12 +19,12 @@ MEANINGS: Final = {
 
 
 class Sieve:
-    """Drops and counts events outside the sensor, in disorder, or on a clock that no others agree on.
+    """Drops and counts events outside the sensor, out of order, or at times that no others agree with.
 
-    The camera's clock may leap or restart as a receiver's stream may: see `CameraClock`.
+    The camera's clock may leap or restart: see `CameraClock`.
 
     Args:
-        unit: What `losses` count positions in: `line` or `row`.
+        unit: The unit of positions in `losses`: `line` or `row`.
         width: Columns of the sensor, or None if unknown.
         height: Rows of the sensor, or None.
     """
@@ -33,38 +33,36 @@ class Sieve:
         self._unit = unit
         self._clock = CameraClock(width or 1 << 16, height or 1 << 16, sparse=True)
         self._firsts: dict[str, int] = {}
-        self._ahead = 0
+        self._row_offset = 0
 
     def sift(self, events: Events, first: int) -> Events:
-        """Return the events to keep, and those held before that have become believed.
+        """Return the events to keep, and earlier ones whose times are now confirmed.
 
         Args:
-            events: The next ones; the columns are the caller's.
+            events: The next events; their columns stay the caller's.
             first: Line or row of the first of them.
         """
-        # Lines are ahead of numbers, by a heading and by those that are empty.
-        self._ahead = first - self._clock.counts["events"]
-        return self._given(self._clock.take(events))
+        # A heading and empty lines are no events.
+        self._row_offset = first - self._clock.counts["events"]
+        return self._restore_times(self._clock.take(events))
 
     def close(self) -> Events:
-        """End the stream: return what is still held, where nothing contradicts it."""
-        return self._given(self._clock.close())
+        """End the stream; return the events still held back that nothing contradicts."""
+        return self._restore_times(self._clock.close())
 
-    def _given(self, pieces: list[Events]) -> Events:
+    def _restore_times(self, pieces: list[Events]) -> Events:
         for name, number in self._clock.firsts.items():
-            self._firsts.setdefault(name, number + self._ahead)
-        kept = [self._on_camera(piece) for piece in pieces]
+            self._firsts.setdefault(name, number + self._row_offset)
+        kept = []
+        for piece in pieces:
+            first_us = int(piece.t_us[0])
+            offset_us = int(self._clock.camera_us(first_us)) - first_us
+            kept.append(Events(piece.t_us + np.int64(offset_us), piece.x, piece.y, piece.p))
         return kept[0] if len(kept) == 1 else Events.concat(kept)
-
-    def _on_camera(self, piece: Events) -> Events:
-        """A piece with the times that it came with."""
-        inside_us = int(piece.t_us[0])
-        offset_us = int(self._clock.camera_us(inside_us)) - inside_us
-        return Events(piece.t_us + np.int64(offset_us), piece.x, piece.y, piece.p)
 
     @property
     def counts(self) -> dict[str, int]:
-        """Restarts of the clock that were believed, where there were any; a long pause is none."""
+        """Confirmed restarts of the clock, if there were any; a long pause is none."""
         restarts = self._clock.counts["clock_restarts"]
         return {"clock_restarts": restarts} if restarts else {}
 
@@ -74,6 +72,6 @@ class Sieve:
         counts = self._clock.counts
         return {
             name: Loss(counts[count], self._firsts[count], self._unit, meaning)
-            for name, (count, meaning) in MEANINGS.items()
+            for name, (count, meaning) in _LOSSES.items()
             if counts[count]
         }

@@ -1,4 +1,4 @@
-"""Columns of arrays: those of NPZ and NPY files here, and what other files of arrays share with them."""
+"""Read columns of arrays: NPZ and NPY files, and what other files of arrays share with them."""
 
 import tempfile
 import zipfile
@@ -12,19 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.columns import PIECE_ROWS, WINDOW_US, EventTable, Piece, one_line
-from evlcp_sdk.io.fields import Fields, fields_of, fields_of_values
+from evlcp_sdk.io.columns import PIECE_ROWS, WINDOW_US, EventTable, Piece, format_error
+from evlcp_sdk.io.fields import Fields, fields_from_names, fields_from_values
 from evlcp_sdk.io.tables import COLUMNS, LAST_VALUES, TRIGGER_COLUMNS, WIRE_TYPES
 from evlcp_sdk.values import Triggers
 
-_LOOKED_AT: Final = 1 << 14
-"""Rows at the start from which columns are recognized."""
+_SAMPLE_ROWS: Final = 1 << 14
+"""Rows at the start by which columns are recognized."""
 
 _TRIGGER_ROWS: Final = 1 << 12
 _MOST_COLUMNS: Final = 8
 
 _MOST_RATIO, _SMALL_BYTES = 100, 1 << 29
-"""How many times more bytes an archive may unpack to than it has, events make 16; how many in any case."""
+"""Most ratio of unpacked bytes to an archive's own, where events make 16; unpacked bytes always allowed."""
 
 
 class Array(Protocol):
@@ -36,14 +36,14 @@ class Array(Protocol):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Type of its values."""
+        """Type of the values."""
 
     def __getitem__(self, key: Any, /) -> Any:
-        """The values of some rows, of a slice; or a column, of a name or of `(slice(None), number)`."""
+        """Return the rows of a slice, or a column by its name or by `(slice(None), number)`."""
 
 
-def upright(array: NDArray[Any]) -> NDArray[Any]:
-    """An array (n,) of one in a single column or row, a table (n, k) of one on its side."""
+def to_upright(array: NDArray[Any]) -> NDArray[Any]:
+    """Return a single column or row as an array (n,), a table that lies on its side as a table (n, k)."""
     if array.ndim != 2 or 1 in array.shape:
         return array.ravel() if array.ndim == 2 else array
     return array if array.shape[0] >= array.shape[1] else array.T
@@ -56,28 +56,28 @@ def choose_columns(
     fields: Fields | None,
     hint: str = "list:PATH?columns=t,p",
 ) -> tuple[list[Array], Fields]:
-    """Time, polarity and, where there are any, x and y: of arrays by name, or of a table among them.
+    """Return time, polarity and perhaps x and y: from arrays by name, or from a table among them.
 
     Args:
         path: The file, for messages.
-        names: Of its arrays.
-        array: Gives one of them.
-        fields: Which column is what; None: as the names say, or else the first rows.
-        hint: How to say which it is, for messages.
+        names: Names of its arrays.
+        array: Returns the array of a name.
+        fields: Which column is what; None recognizes it by names, or else by the first rows.
+        hint: How to state the columns, for messages.
 
     Raises:
-        InputError: There are no such columns, or they are no numbers, or of other lengths.
+        InputError: There are no such columns, or they are no numbers, or of different lengths.
     """
-    found = fields or fields_of(names)
+    found = fields or fields_from_names(names)
     if found is None and len(names) == 2:
-        with suppress(InputError):  # beside a table, something else
-            found = _fields_of([array(name) for name in names])
-    if found is None or max(found.which) >= len(names):
+        with suppress(InputError):  # one may be a table, the other something else
+            found = _fields_from_sample([array(name) for name in names])
+    if found is None or max(found.numbers) >= len(names):
         named, found = _choose_table(path, names, array, fields, hint)
     else:
-        named = [(names[k], array(names[k])) for k in found.which]
+        named = [(names[k], array(names[k])) for k in found.numbers]
     if any(column.shape == () for _, column in named[2:]):
-        # Where the pixels are, not a place of each event.
+        # One x or y is no column of events.
         found, named = replace(found, places=None), named[:2]
     for (name, column), kinds in zip(named, ("iuf", "iubfUS", "iuf", "iuf"), strict=False):
         if column.dtype.kind not in kinds or len(column.shape) != 1:
@@ -90,7 +90,7 @@ def choose_columns(
 def _choose_table(
     path: Path, names: Sequence[str], array: Callable[[str], Array], fields: Fields | None, hint: str
 ) -> tuple[list[tuple[str, Array]], Fields]:
-    """The columns of the first table in which they are recognized, one of a short name before others."""
+    """Return the columns of the first table in which they are recognized, short names first."""
     for name in sorted(names, key=len):
         try:
             table = array(name)
@@ -102,20 +102,19 @@ def _choose_table(
         if len(table.shape) == 2 and 1 < table.shape[1] <= _MOST_COLUMNS:
             parts = [(slice(None), k) for k in range(table.shape[1])]
         columns: list[Array] = [table[part] for part in parts]
-        found = fields or (fields_of(table.dtype.names) if table.dtype.names else None) or _fields_of(columns)
-        if found is not None and max(found.which) < len(columns):
-            return [(name, columns[k]) for k in found.which], found
+        found = fields or fields_from_names(table.dtype.names or ()) or _fields_from_sample(columns)
+        if found is not None and max(found.numbers) < len(columns):
+            return [(name, columns[k]) for k in found.numbers], found
     raise InputError(
         f"{path}: found the arrays {', '.join(sorted(names)) or 'none'}, expected t and p or a table"
         f" of them (or say which columns they are, as by {hint})"
     )
 
 
-def _fields_of(columns: Sequence[Array]) -> Fields | None:
-    """Which of some columns is what, by the first rows."""
-    if not columns or not all(one.dtype.kind in "iubfUS" and len(one.shape) == 1 for one in columns):
+def _fields_from_sample(columns: Sequence[Array]) -> Fields | None:
+    if not columns or not all(column.dtype.kind in "iubfUS" and len(column.shape) == 1 for column in columns):
         return None
-    return fields_of_values([column[:_LOOKED_AT] for column in columns])
+    return fields_from_values([column[:_SAMPLE_ROWS] for column in columns])
 
 
 def _check_lengths(path: Path, columns: Mapping[str, Array]) -> None:
@@ -124,8 +123,8 @@ def _check_lengths(path: Path, columns: Mapping[str, Array]) -> None:
         raise InputError(f"{path}: found arrays of the lengths {lengths}, expected one length")
 
 
-def pieces_of(columns: Sequence[Array], size_bytes: int) -> Iterator[Piece]:
-    """The rows of columns: time, polarity and perhaps x and y; of a file of so many bytes."""
+def split_pieces(columns: Sequence[Array], size_bytes: int) -> Iterator[Piece]:
+    """Yield the rows of the columns time, polarity and perhaps x and y, of a file of so many bytes."""
     rows = columns[0].shape[0]
     for first in range(0, rows, PIECE_ROWS):
         part = slice(first, min(first + PIECE_ROWS, rows))
@@ -138,28 +137,28 @@ def pieces_of(columns: Sequence[Array], size_bytes: int) -> Iterator[Piece]:
         yield Piece((times, *others), (first + 1).__add__, done)
 
 
-def _mapped(name: str, file: Path) -> NDArray[Any]:
-    """An array in NumPy's format, upright; what is looked at takes memory, not all of it.
+def _map_array(name: str, file: Path) -> NDArray[Any]:
+    """Map an array in NumPy's format into memory.
 
     Raises:
-        InputError: It is none.
+        InputError: The file is damaged or has another format.
     """
     try:
-        return upright(np.lib.format.open_memmap(file, mode="r"))
+        return to_upright(np.lib.format.open_memmap(file, mode="r"))
     except Exception as error:
-        # NumPy evaluates the header as a piece of Python, which may fail in any way.
-        raise InputError(f"{name}: found no array of numbers ({one_line(error)})") from error
+        # NumPy evaluates the header as Python, which may fail in any way.
+        raise InputError(f"{name}: found no array of numbers ({format_error(error)})") from error
 
 
 def read_npy(path: Path, _: ExitStack, fields: Fields | None) -> EventTable:
-    """A table in an NPY file, of records, (n, k) or (k, n)."""
-    array = _mapped(str(path), path)
+    """Read a table in an NPY file, of records, (n, k) or (k, n)."""
+    array = _map_array(str(path), path)
     columns, found = choose_columns(path, [path.name], lambda _: array, fields)
-    return EventTable("NPY", pieces_of(columns, path.stat().st_size), found.unit)
+    return EventTable("NPY", split_pieces(columns, path.stat().st_size), found.unit)
 
 
 def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
-    """Arrays of an NPZ file, or a table in one; in our own names with triggers and the sensor's size.
+    """Read arrays of an NPZ file, or a table in one; our own file may have triggers and the sensor's size.
 
     They are unpacked into a temporary folder, so that none has to be in memory.
     """
@@ -168,9 +167,9 @@ def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
     except (zipfile.BadZipFile, UnicodeDecodeError, NotImplementedError) as error:
         raise InputError(f"{path}: found no NPZ file, expected one ({error})") from error
     names = [member.removesuffix(".npy") for member in archive.namelist() if member.endswith(".npy")]
-    size, whole = path.stat().st_size, sum(member.file_size for member in archive.infolist())
-    if whole > _MOST_RATIO * size + _SMALL_BYTES:
-        raise InputError(f"{path}: {size} bytes are said to unpack to {whole}, more than events can")
+    size, unpacked = path.stat().st_size, sum(member.file_size for member in archive.infolist())
+    if unpacked > _MOST_RATIO * size + _SMALL_BYTES:
+        raise InputError(f"{path}: {size} bytes are said to unpack to {unpacked}, more than events can")
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="evlcp-"))
 
     def array(name: str) -> NDArray[Any]:
@@ -178,14 +177,16 @@ def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
             file = archive.extract(f"{name}.npy", folder)
         except Exception as error:
             # Codecs and encryption fail in many ways.
-            raise InputError(f"{path}: array {name}: damaged: {one_line(error)}") from error
-        return _mapped(f"{path}: array {name}", Path(file))
+            raise InputError(f"{path}: array {name}: damaged: {format_error(error)}") from error
+        return _map_array(f"{path}: array {name}", Path(file))
 
     columns, found = choose_columns(path, names, array, fields)
-    pieces = pieces_of(columns, path.stat().st_size)
+    pieces = split_pieces(columns, path.stat().st_size)
     if fields is not None or not set(COLUMNS) <= set(names):
         return EventTable("NPZ", pieces, found.unit)
-    sensor = [_one(path, name, array(name)) if name in names else None for name in ("width", "height")]
+    width, height = (
+        _read_scalar(path, name, array(name)) if name in names else None for name in ("width", "height")
+    )
     triggers: dict[str, Array] = {}
     if "trigger_t_us" in names:
         for name in TRIGGER_COLUMNS:
@@ -193,23 +194,22 @@ def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
                 raise InputError(f"{path}: found the arrays {', '.join(sorted(names))}, expected {name} too")
             triggers[name] = array(name)
     _check_lengths(path, triggers)
-    given = _triggers(path, triggers) if triggers else None
-    return EventTable(
-        "NPZ", pieces, found.unit, size=(sensor[0], sensor[1]), triggers=given, window_us=WINDOW_US
-    )
+    edges = _read_triggers(path, triggers) if triggers else None
+    return EventTable("NPZ", pieces, found.unit, size=(width, height), triggers=edges, window_us=WINDOW_US)
 
 
-def _triggers(path: Path, columns: Mapping[str, Array]) -> Iterator[Triggers]:
+def _read_triggers(path: Path, columns: Mapping[str, Array]) -> Iterator[Triggers]:
     for first in range(0, columns["trigger_t_us"].shape[0], _TRIGGER_ROWS):
         part = slice(first, first + _TRIGGER_ROWS)
-        yield Triggers(*(_bounded(path, name, column[part], first) for name, column in columns.items()))
+        values = (_convert_values(path, name, column[part], first) for name, column in columns.items())
+        yield Triggers(*values)
 
 
-def _bounded(path: Path, name: str, values: NDArray[Any], row: int) -> NDArray[Any]:
-    """Values of a column of ours, from a row on, in its type.
+def _convert_values(path: Path, name: str, values: NDArray[Any], row: int) -> NDArray[Any]:
+    """Convert values of one of our columns, from a row on, to its type.
 
     Raises:
-        InputError: One is no integer, or has no place in the column.
+        InputError: A value is no integer, or out of the column's range.
     """
     last = LAST_VALUES.get(name, 0xFFFF)
     first = -last if name == "trigger_t_us" else 0
@@ -224,8 +224,7 @@ def _bounded(path: Path, name: str, values: NDArray[Any], row: int) -> NDArray[A
     return values.astype(WIRE_TYPES.get(name, np.dtype(np.int64)))
 
 
-def _one(path: Path, name: str, array: NDArray[Any]) -> int:
-    """The only value of an array."""
+def _read_scalar(path: Path, name: str, array: NDArray[Any]) -> int:
     if array.shape not in ((), (1,)):
         raise InputError(f"{path}: array {name}: found {array.shape} values, expected one")
-    return int(_bounded(path, name, array.ravel(), 0)[0])
+    return int(_convert_values(path, name, array.ravel(), 0)[0])

@@ -1,4 +1,4 @@
-"""Cameras by the driver `neuromorphic-drivers`: the EVK4, others with its chip's bus, and the EVK3 HD."""
+"""Open cameras by the driver `neuromorphic-drivers`: the EVK4, others with its chip's bus, the EVK3 HD."""
 
 import contextlib
 import importlib
@@ -12,35 +12,35 @@ import numpy as np
 
 from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
 from evlcp_sdk.io.evt import EVT3
-from evlcp_sdk.io.raw import ChunkBytes, RawSource, format_header
-from evlcp_sdk.io.urls import flag, positive, split_options
+from evlcp_sdk.io.raw import ChunkReader, RawSource, format_header
+from evlcp_sdk.io.urls import parse_flag, parse_positive, split_options
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.suggestions import nearest
 
-_KINDS: Final = {"PROPHESEE_EVK4": "prophesee_evk4", "PROPHESEE_EVK3_HD": "prophesee_evk3_hd"}
-"""Of the driver's names those that send EVT3, and the module that configures each."""
+_MODULES: Final = {"PROPHESEE_EVK4": "prophesee_evk4", "PROPHESEE_EVK3_HD": "prophesee_evk3_hd"}
+"""Devices that send EVT3, and the driver's module for each."""
 
 _WAIT_S: Final = 0.05
-"""How long a read waits for the driver before it looks whether it was closed."""
+"""How long a read waits for the driver before it checks whether it was closed."""
 
 _PERIOD_US: Final = 200
-"""The event-rate limit counts in periods so long."""
+"""The event-rate limit counts events in periods of this length."""
 
 _MOST_PER_PERIOD: Final = (1 << 22) - 1
 
 _RING_PACKETS: Final = 1024
-"""USB packets that the driver holds at the most, of 128 KB each: a second of the most that a camera sends."""
+"""USB packets of 128 KB in the driver's ring: a second of the most that a camera sends."""
 
 _SETTLE_S: Final = 1.0
-"""How long a camera that is gone is kept before it is closed: the driver frees transfers that libusb's own
-thread is still giving up, and aborts on it. That takes milliseconds, unless other work has the processor."""
+"""How long to keep an unplugged camera before it is closed: the driver aborts if it frees transfers that
+libusb's thread is still giving up. That takes milliseconds, unless other work has the processor."""
 
-_HEALTH_EVERY_S: Final = 5.0
+_HEALTH_PERIOD_S: Final = 5.0
 
 _MOST_FAULTS: Final = 8
 
 _UNPLUGGED: Final = ("NoDevice", "No such device", "Rusb(Io", "Input/output", "Pipe")
-_NEXT_STEPS: Final = (
+_HINTS: Final = (
     (
         ("no device found", "device not found", "NotFound", "Entity not found"),
         "no camera was found: plug it into a USB 3 port by its own cable, see that it is lit, and that lsusb"
@@ -73,23 +73,23 @@ def open_camera(url: str) -> "CameraSource":
         raise ConfigError(
             f"{url}: needs the driver, which comes with the extra: pip install 'evlcp-sdk[camera]'"
         ) from fault
-    biases = [field.name for kind in _KINDS.values() for field in fields(getattr(driver, kind).Biases)]
-    named, options = split_options(url, _OPTIONS | dict.fromkeys(biases, _whole))
-    serial = named.partition(":")[2].removeprefix("//") or None
-    with _explained(url):
-        listed = [one for one in driver.list_devices() if serial in (None, one.serial)]
-    known = [one for one in listed if one.name.name in _KINDS]
-    for one in listed:
+    biases = [field.name for kind in _MODULES.values() for field in fields(getattr(driver, kind).Biases)]
+    name, options = split_options(url, _OPTIONS | dict.fromkeys(biases, _parse_integer))
+    serial = name.partition(":")[2].removeprefix("//") or None
+    with _explain_faults(url):
+        devices = [one for one in driver.list_devices() if serial in (None, one.serial)]
+    known = [one for one in devices if one.name.name in _MODULES]
+    for one in devices:
         if one.error is not None and not any(other.error is None for other in known):
-            raise _fault(url, str(one.error))
+            raise _make_error(url, str(one.error))
     if not known:
-        others = ", ".join(one.name.value for one in listed)
+        others = ", ".join(one.name.value for one in devices)
         if others:
             raise InputError(f"{url}: found {others}, expected an EVK4, or another camera with EVT3 words")
-        raise _fault(url, "with serial" if serial else "no device found")
-    kind = getattr(driver, _KINDS[known[0].name.name])
-    configuration = _configured(url, kind, options)
-    with _explained(url):
+        raise _make_error(url, "with serial" if serial else "no device found")
+    kind = getattr(driver, _MODULES[known[0].name.name])
+    configuration = _make_configuration(url, kind, options)
+    with _explain_faults(url):
         device = driver.open(
             replace(configuration, biases=kind.Biases()),
             raw=True,
@@ -109,38 +109,40 @@ def open_camera(url: str) -> "CameraSource":
 class CameraSource(RawSource):
     """A camera, opened by `open_camera`; its words are decoded as those of a file.
 
-    What its driver had to drop is the loss `camera_overflow`. Unplugged, a read raises `UnpluggedError`.
+    USB packets that the driver drops are the loss `camera_overflow`. A read after it is unplugged raises an
+    `UnpluggedError`.
     """
 
     live = True
 
     def __init__(self, url: str, device: Any, width: int, height: int) -> None:
-        self._bytes = _CameraBytes(url, device, format_header(EVT3, width, height))
+        self._bytes = _CameraReader(url, device, format_header(EVT3, width, height))
         super().__init__(url, file=self._bytes)
         self.format = str(device.name().value)
 
     @property
     def losses(self) -> dict[str, Loss]:
-        """As `EventSource.losses`, with what the driver dropped."""
+        """As `EventSource.losses`, with the driver's."""
         dropped = self._bytes.dropped
         return super().losses | ({"camera_overflow": dropped} if dropped.count else {})
 
     @property
     def health(self) -> Mapping[str, float | int | str]:
-        """As `EventSource.health`: `temperature_c`, `backlog` (USB packets that wait), `dropped`.
+        """As `EventSource.health`: `temperature_c`, `backlog` (USB packets that wait), `dropped`,
+        `overflows`.
 
-        `overflows`: how many times the driver's ring was full (its clutch engaged), so that it dropped some
-        until it was read on.
+        At an overflow the driver's ring is full (its clutch engaged), and packets are dropped until it is
+        read.
         """
         return dict(self._bytes.health)
 
 
-class _CameraBytes(ChunkBytes):
-    """What the camera sends, behind a header that says what it is.
+class _CameraReader(ChunkReader):
+    """The bytes that the camera sends, behind a header.
 
     Attributes:
         dropped: USB packets that the driver dropped so far.
-        health: As of the source.
+        health: The health of the source.
     """
 
     def __init__(self, url: str, device: Any, header: bytes) -> None:
@@ -149,7 +151,7 @@ class _CameraBytes(ChunkBytes):
         self._device = device
         self._lock = threading.Lock()
         self._closed = False
-        self._asked_s = -_HEALTH_EVERY_S
+        self._health_s = -_HEALTH_PERIOD_S
         what = "USB packets that the driver had no room for; the program was too slow"
         self.dropped = Loss(0, 0, "byte", what)
         self._overflows = self._dropped_before = 0
@@ -157,8 +159,8 @@ class _CameraBytes(ChunkBytes):
         self._faults: list[Exception] = []
         self.health: dict[str, float | int | str] = {}
 
-    def more(self) -> bytes:
-        """Wait for bytes; nothing once it is closed.
+    def read_chunk(self) -> bytes:
+        """Wait for bytes; return none once the camera is closed.
 
         Raises:
             UnpluggedError: The camera is gone.
@@ -171,29 +173,29 @@ class _CameraBytes(ChunkBytes):
                 try:
                     status, data = next(self._device)
                 except (RuntimeError, StopIteration) as fault:
-                    # The driver says so before it gives what it still holds, and may say it twice.
+                    # The driver fails before it gives what it still holds, and may fail twice.
                     self._faults.append(fault)
                     if len(self._faults) <= _MOST_FAULTS:
                         continue
                     status = data = None
                 if data is None and self._faults:
-                    raise _fault(self._url, str(self._faults[0]), gone=True) from self._faults[0]
-                self._look(status)
+                    raise _make_error(self._url, str(self._faults[0]), gone=True) from self._faults[0]
+                self._update_health(status)
         return data
 
-    def _look(self, status: Any) -> None:
-        """Take note of what the driver says of itself, and now and then of the camera."""
+    def _update_health(self, status: Any) -> None:
+        """Update health and losses by the driver's status, and now and then by the camera's temperature."""
         now_s = time.monotonic()
-        if now_s >= self._asked_s + _HEALTH_EVERY_S:
-            self._asked_s = now_s
-            # It may have no thermometer, and a measurement may fail.
+        if now_s >= self._health_s + _HEALTH_PERIOD_S:
+            self._health_s = now_s
+            # The camera may have no thermometer, and a measurement may fail.
             with contextlib.suppress(RuntimeError, AttributeError):
                 self.health["temperature_c"] = round(float(self._device.temperature_celsius()), 1)
         if status.ring is None:
             return
         total = int(status.ring.dropped_packets)
         if total > self._dropped_before:
-            self.dropped = self.dropped.more(total - self._dropped_before, self.given)
+            self.dropped = self.dropped.more(total - self._dropped_before, self.bytes_read)
         self._dropped_before = total
         engaged = bool(status.ring.clutch_engaged)
         self._overflows += engaged and not self._engaged
@@ -205,30 +207,30 @@ class _CameraBytes(ChunkBytes):
         }
 
     def close(self) -> None:
-        """Let the camera go; a read in another thread ends soon."""
-        gone = bool(self._faults) and not self._closed
+        """Close the camera; a read in another thread ends soon."""
+        is_gone = bool(self._faults) and not self._closed
         self._closed = True
-        if gone:
+        if is_gone:
             time.sleep(_SETTLE_S)
         with self._lock, contextlib.suppress(RuntimeError):
             self._device.close()
 
 
-def _whole(text: str) -> int:
+def _parse_integer(text: str) -> int:
     try:
         return int(text)
     except ValueError as fault:
         raise ValueError("a whole number") from fault
 
 
-def _rate(text: str) -> float:
-    rate = positive(text)
+def _parse_rate(text: str) -> float:
+    rate = parse_positive(text)
     if not 1 <= rate * _PERIOD_US * 1e-6 <= _MOST_PER_PERIOD:
         raise ValueError(f"{1e6 / _PERIOD_US:g} to {_MOST_PER_PERIOD * 1e6 / _PERIOD_US:.3g} events a second")
     return rate
 
 
-def _areas(text: str) -> list[tuple[int, int, int, int]]:
+def _parse_areas(text: str) -> list[tuple[int, int, int, int]]:
     areas = []
     for one in text.split(";"):
         sides = [int(side) for side in one.split(",") if side.isascii() and side.isdigit()]
@@ -238,30 +240,33 @@ def _areas(text: str) -> list[tuple[int, int, int, int]]:
     return areas
 
 
-_OPTIONS: Final[dict[str, Callable[[str], Any]]] = {"events_per_s": _rate, "area": _areas, "trigger": flag}
-"""Those beside biases."""
+_OPTIONS: Final[dict[str, Callable[[str], Any]]] = {
+    "events_per_s": _parse_rate,
+    "area": _parse_areas,
+    "trigger": parse_flag,
+}
+"""The parsers of all options but biases."""
 
 
-def _configured(url: str, kind: Any, options: Mapping[str, Any]) -> Any:
-    """The driver's configuration of a camera."""
+def _make_configuration(url: str, kind: Any, options: Mapping[str, Any]) -> Any:
     known = [*_OPTIONS, *(field.name for field in fields(kind.Biases))]
     for name in options:
         if name not in known:
             raise InputError(f"{url}: option {name!r}{nearest(name, known)}")
     biases = {name: value for name, value in options.items() if name not in _OPTIONS}
-    chosen: dict[str, Any] = {"biases": replace(kind.Biases(), **biases)}
+    settings: dict[str, Any] = {"biases": replace(kind.Biases(), **biases)}
     if "trigger" in options:
-        chosen["enable_external_trigger"] = options["trigger"]
+        settings["enable_external_trigger"] = options["trigger"]
     if "events_per_s" in options:
         per_period = round(options["events_per_s"] * _PERIOD_US * 1e-6)
-        chosen["rate_limiter"] = kind.RateLimiter(_PERIOD_US, per_period)
+        settings["rate_limiter"] = kind.RateLimiter(_PERIOD_US, per_period)
     if "area" in options:
-        chosen |= _masks(url, kind, options["area"])
-    return kind.Configuration(**chosen)
+        settings |= _make_masks(url, kind, options["area"])
+    return kind.Configuration(**settings)
 
 
-def _masks(url: str, kind: Any, areas: Sequence[tuple[int, int, int, int]]) -> dict[str, Any]:
-    """Masks of all columns and rows that no area has."""
+def _make_masks(url: str, kind: Any, areas: Sequence[tuple[int, int, int, int]]) -> dict[str, Any]:
+    """Return masks of the columns and rows that lie in no area."""
     width, height = int(kind.Properties().width), int(kind.Properties().height)
     mask = kind.RowColumnMask(set=True)
     for x, y, wide, high in areas:
@@ -274,10 +279,10 @@ def _masks(url: str, kind: Any, areas: Sequence[tuple[int, int, int, int]]) -> d
 
 
 def _set_biases(url: str, kind: Any, device: Any, configuration: Any) -> None:
-    """Set biases after they are found within the camera's bounds: the driver takes any."""
+    """Set biases that are within the camera's bounds, which the driver does not check."""
     if configuration.biases == kind.Biases():
         return
-    with _explained(url):
+    with _explain_faults(url):
         bounds = device.biases_bounds()
     for field in fields(configuration.biases):
         value, default = (getattr(some, field.name) for some in (configuration.biases, kind.Biases()))
@@ -286,26 +291,26 @@ def _set_biases(url: str, kind: Any, device: Any, configuration: Any) -> None:
             raise ConfigError(
                 f"{url}: {field.name} = {value}: expected {int(limits.minimum)} to {int(limits.maximum)}"
             )
-    whole = {f.name: np.int16(getattr(configuration.biases, f.name)) for f in fields(kind.Biases)}
-    with _explained(url):
-        device.update_configuration(replace(configuration, biases=kind.Biases(**whole)))
+    biases = {f.name: np.int16(getattr(configuration.biases, f.name)) for f in fields(kind.Biases)}
+    with _explain_faults(url):
+        device.update_configuration(replace(configuration, biases=kind.Biases(**biases)))
 
 
 @contextlib.contextmanager
-def _explained(url: str) -> Iterator[None]:
-    """Turn the driver's faults, plain RuntimeErrors, into one line with the next step."""
+def _explain_faults(url: str) -> Iterator[None]:
+    """Turn the driver's RuntimeErrors into one line with the next step."""
     try:
         yield
     except RuntimeError as fault:
-        raise _fault(url, str(fault)) from fault
+        raise _make_error(url, str(fault)) from fault
 
 
-def _fault(url: str, text: str, gone: bool = False) -> InputError:
+def _make_error(url: str, text: str, gone: bool = False) -> InputError:
     if gone or any(word in text for word in _UNPLUGGED):
         return UnpluggedError(
             f"{url}: the camera is gone ({text}): see its cable and port; --reconnect goes on when it is back"
         )
-    for words, step in _NEXT_STEPS:
+    for words, step in _HINTS:
         if any(word in text for word in words):
             return InputError(f"{url}: {step}")
     return InputError(f"{url}: the driver says: {text}")

@@ -1,4 +1,4 @@
-"""What a recording holds, without decoding its light, and whether it is of the link's sensor."""
+"""Summarize a recording without decoding its light, and check that it is of the link's sensor."""
 
 from dataclasses import asdict
 from typing import Any
@@ -13,10 +13,10 @@ RATE_WINDOW_US = 10_000
 """The peak rate is the most events in a window of this length on a fixed grid."""
 
 
-def recording_table(
+def summarize_source(
     source: EventSource, name: str, first_us: int | None, last_us: int | None
 ) -> dict[str, Any]:
-    """What summaries say of a source that was read: file, sensor, time and rate, as JSON values."""
+    """Return the file, sensor, time and event rate of a source that was read, as JSON values."""
     duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
     return {
         "path": name,
@@ -32,14 +32,16 @@ def recording_table(
     }
 
 
-def describe(source: EventSource, name: str) -> dict[str, Any]:
-    """What a source, called `name`, holds as JSON values, read to its end in constant memory; not closed.
+def describe_source(source: EventSource, name: str) -> dict[str, Any]:
+    """Read a source called `name` to its end, in constant memory; return what it holds as JSON values.
+
+    The source is not closed.
 
     Raises:
         InputError: It cannot be read on.
     """
     first_us = last_us = None
-    positive = 0
+    parse_positive = 0
     window, in_window, peak = -1, 0, 0
     edges = np.zeros((256, 2), np.int64)
     for events, triggers in source.stream():
@@ -49,16 +51,16 @@ def describe(source: EventSource, name: str) -> dict[str, Any]:
             continue
         first_us = int(events.t_us[0]) if first_us is None else first_us
         last_us = int(events.t_us[-1])
-        positive += int(events.p.sum(dtype=np.int64))
+        parse_positive += int(events.p.sum(dtype=np.int64))
         windows, counts = np.unique(events.t_us // RATE_WINDOW_US, return_counts=True)
         for w, n in zip(windows.tolist(), counts.tolist(), strict=True):
             in_window = in_window + n if w == window else n
             window, peak = w, max(peak, in_window)
     total = source.counts["events"]
-    return recording_table(source, name, first_us, last_us) | {
+    return summarize_source(source, name, first_us, last_us) | {
         "header": dict(source.header),
         "peak_events_per_s": round(peak * 1e6 / RATE_WINDOW_US),
-        "positive_share": round(positive / total, 4) if total else None,
+        "positive_share": round(parse_positive / total, 4) if total else None,
         "triggers": [
             {"channel": channel, "edge": ("falling", "rising")[value], "count": int(edges[channel, value])}
             for channel, value in np.argwhere(edges).tolist()
@@ -69,9 +71,7 @@ def describe(source: EventSource, name: str) -> dict[str, Any]:
 
 
 def check_sensor(source: EventSource, url: object, camera: CameraModel) -> None:
-    """Refuse a recording, called `url`, of another sensor than the link's camera has.
-
-    One that does not say its size passes.
+    """Check that a recording called `url` has the size of the link's camera, or states none.
 
     Raises:
         ConfigError: The sizes differ.

@@ -1,4 +1,4 @@
-"""How events become words and words events: EVT2, 32 bits an event; EVT3, 16 bits a change."""
+"""Encode events to words and decode them: EVT2, 32 bits an event; EVT3, 16 bits a change."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,7 +13,6 @@ from evlcp_sdk.values import Events, Triggers
 
 MAX_SIDE = 2048
 """Columns and rows that 11 bits can address."""
-
 
 NO_TRIGGERS = Triggers.empty()
 
@@ -50,14 +49,14 @@ LOSSES: Final = {
         "header without '% end'; data taken to start at the first line without '% '",
     ),
 }
-"""What a RAW file may lose: name -> (row of the tally, meaning)."""
+"""Losses of a RAW file: name -> (row of the tally, meaning)."""
 
 COUNTS: Final = {
     "rollovers": _kernels.ROLLOVERS,
     "time_gaps": _kernels.TIME_GAPS,
     "other_words": _kernels.OTHER_WORDS,
 }
-"""What is no loss: rollovers of the clock, its steps by more than one, words without events."""
+"""Counts that are no losses: rollovers of the clock, its steps by more than one, words without events."""
 
 
 @dataclass(frozen=True)
@@ -65,16 +64,16 @@ class Codec:
     """One encoding of events in words.
 
     Attributes:
-        name: As after `% format`.
-        version: As after `% evt`.
+        name: Name after `% format`.
+        version: Version after `% evt`.
         word: Type of a word, little-endian.
         burst: Most events that one word may bring.
-        types: The word types that exist, bit by bit; the top 4 bits of a word.
+        types: Bit mask of the word types that exist; a type is the top 4 bits of a word.
         channels: Trigger inputs that a word can name.
         time_bits: Bits of TIME_HIGH, and of the time below it.
-        rollover: Words with which the clock rolls over once and stands at 0, in steps that are believed.
-        decoder: Its decoding kernel.
-        encoder: Its encoding kernel.
+        rollover: Words that roll the clock over once, to 0, in steps that a decoder accepts.
+        decoder: The decoding kernel.
+        encoder: The encoding kernel.
     """
 
     name: str
@@ -88,17 +87,17 @@ class Codec:
     decoder: Callable[..., Any]
     encoder: Callable[..., Any]
 
-    def prelude(self, first_us: int) -> tuple[NDArray[Any], int]:
-        """Return the words before a first time, and the number of the TIME_HIGH that they end with."""
+    def encode_prelude(self, first_us: int) -> tuple[NDArray[Any], int]:
+        """Return the words that set the clock before a first time, and the TIME_HIGH that they end with."""
         high, low = self.time_bits
         rollovers, step = divmod(first_us >> low, 1 << high)
-        # A third of the range at a time: a longer step would look like one back.
+        # A third of the range at a time: a longer step would read as one back.
         third = len(self.rollover) // 5
-        way = self.rollover[: third * (3 * step >> high)] if rollovers else ()
-        return np.array(self.rollover * rollovers + way, self.word), (first_us >> low) - 1
+        partial = self.rollover[: third * (3 * step >> high)] if rollovers else ()
+        return np.array(self.rollover * rollovers + partial, self.word), (first_us >> low) - 1
 
-    def reserved(self, words: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which of `words` are of a type that does not exist."""
+    def find_reserved(self, words: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which words are of a type that does not exist, bool (n,)."""
         kinds = words >> (8 * self.word.itemsize - 4)
         return np.asarray(self.types >> kinds.astype(np.int64) & 1 == 0)
 
@@ -111,7 +110,7 @@ def encode_evt2(
     triggers: _kernels.TriggerColumns,
     j: int,
 ) -> tuple[int, int, int]:
-    """Encode to EVT2 words; as `encode_evt3`, but the last TIME_HIGH is all the state."""
+    """Encode to EVT2 words as `encode_evt3` does; the state is only the last TIME_HIGH."""
     most = len(words) // 4
     t, x, y, p = (column[i : i + most].astype(np.int64) for column in events)
     trigger_t, channel, value = (column[j : j + most].astype(np.int64) for column in triggers)
@@ -120,7 +119,7 @@ def encode_evt2(
     order = np.argsort(times, kind="stable")[:most]
     steps, low = np.divmod(times[order], 64)
     before = np.concatenate([state[:1], steps[:-1]])
-    # Further on, a rollover would look like a glitch.
+    # After a longer step a rollover would read as a glitch.
     highs = np.where(before < 0, steps > before, -((before - steps) >> 26))
     ends = np.cumsum(highs + 1)
     rows = int(np.searchsorted(ends, len(words), "right"))
@@ -164,8 +163,8 @@ EVT3: Final = Codec(
 """t = rollovers * 2^24 + TIME_HIGH * 2^12 + TIME_LOW, us."""
 
 
-class Columns:
-    """Room for events and triggers, filled from the front by a decoder."""
+class EventBuffer:
+    """Columns of events and triggers that a decoder fills from the front."""
 
     def __init__(self, events: int, triggers: int) -> None:
         self.events = self.triggers = 0
@@ -173,8 +172,8 @@ class Columns:
         self.event_columns = tuple(np.empty(events, kind) for kind in ("i8", "u2", "u2", "u1"))
         self.trigger_columns = tuple(np.empty(triggers, kind) for kind in ("i8", "u1", "u1"))
 
-    def taken(self) -> tuple[Events, Triggers]:
-        """Return what is filled, as views; as copies where it is little, so as not to hold all the room."""
+    def get_filled(self) -> tuple[Events, Triggers]:
+        """Return the events and triggers so far: views, or copies if they fill less than half of the room."""
         columns: Iterator[Any] = (column[: self.events] for column in self.event_columns)
         if 2 * self.events < self.room:
             columns = (column.copy() for column in columns)
@@ -183,11 +182,11 @@ class Columns:
 
 
 class Decoder:
-    """The state of decoding one stream of words; the same for every split of the stream.
+    """Decodes one stream of words, however it is split.
 
     Args:
         codec: The encoding.
-        width: Columns of the sensor; None accepts all that 11 bits can say.
+        width: Columns of the sensor; None accepts all that 11 bits can address.
         height: Rows of the sensor, likewise.
     """
 
@@ -197,26 +196,26 @@ class Decoder:
         self._state = np.zeros(_kernels.STATE_SLOTS, np.int64)
         self._state[_kernels.BASE] = _kernels.UNKNOWN_TIME
         self._state[_kernels.PACKED] = _kernels.PACKED_TIME << _kernels.PACKED_LOW
-        self._forget()
+        self._forget_position()
         self._tally = np.zeros((_kernels.TALLY_ROWS, 2), np.int64)
 
-    def _forget(self) -> None:
-        """Know neither the row nor the column of an event that comes, as EVT3 has them in words before it."""
+    def _forget_position(self) -> None:
+        """Forget the row and column of the next event, which EVT3 has in earlier words."""
         packed = int(self._state[_kernels.PACKED]) & ~(0xFFFF << _kernels.PACKED_ROW)
         self._state[_kernels.PACKED] = packed | _kernels.UNKNOWN_ROW << _kernels.PACKED_ROW
         self._state[_kernels.COLUMN], self._state[_kernels.VECTOR_LEFT] = _kernels.UNKNOWN_COLUMN, 0
 
     @property
     def has_time(self) -> bool:
-        """Whether a TIME_HIGH has come by."""
+        """Whether a TIME_HIGH has been decoded."""
         return bool(self._state[_kernels.BASE] != _kernels.UNKNOWN_TIME)
 
-    def decode(self, words: NDArray[Any], at: int, out: Columns, final: bool) -> int:
-        """Decode `words`, whose first is at byte `at`, behind what is in `out`; return the bytes used.
+    def decode(self, words: NDArray[Any], at: int, out: EventBuffer, final: bool) -> int:
+        """Decode `words`, the first of which is at byte `at`, append to `out`, and return the bytes used.
 
-        It stops early when `out` has no room for another word's events (`codec.burst`) or trigger; and where
-        it takes more words, up to `LOOK_BYTES`, to believe the time, unless these are the `final` ones; and
-        where words do not go on behind the last one, but some bytes later, which are used, too.
+        Decoding stops early where `out` has no room for another word's events (`codec.burst`) or trigger;
+        where more words, up to `LOOKAHEAD_BYTES`, are needed to confirm the time, unless these are the
+        `final` ones; and where words are misaligned: the bytes to skip then count as used.
         """
         used, out.events, out.triggers, askew = self.codec.decoder(
             words,
@@ -230,22 +229,22 @@ class Decoder:
         )
         used = int(used) * self.codec.word.itemsize
         if askew:
-            # What follows has no time before the next TIME_HIGH.
-            self.note(_kernels.REALIGNED, at + used, int(askew))
-            self._state[_kernels.DOUBT], self._state[_kernels.LEVEL] = 1, at + used + askew
-            self._forget()
+            # Before the next TIME_HIGH there is no time.
+            self.count_loss(_kernels.REALIGNED, at + used, int(askew))
+            self._state[_kernels.UNCONFIRMED], self._state[_kernels.ALIGNED_UNTIL] = 1, at + used + askew
+            self._forget_position()
         return used + int(askew)
 
     def finish(self, at: int, odd_bytes: int) -> None:
-        """Take note of how the stream ends: at byte `at`, with `odd_bytes` that make no word."""
+        """Count what is lost at the end of the stream, byte `at`, with `odd_bytes` that make no word."""
         if odd_bytes:
-            self.note(_kernels.ODD_BYTES, at, odd_bytes)
+            self.count_loss(_kernels.ODD_BYTES, at, odd_bytes)
         if self._state[_kernels.VECTOR_LEFT]:
-            self.note(_kernels.VECTOR_CUT, int(self._state[_kernels.VECTOR_AT]))
+            self.count_loss(_kernels.VECTOR_CUT, int(self._state[_kernels.VECTOR_AT]))
             self._state[_kernels.VECTOR_LEFT] = 0
 
-    def note(self, row: int, at: int, count: int = 1) -> None:
-        """Count a loss, at byte `at`."""
+    def count_loss(self, row: int, at: int, count: int = 1) -> None:
+        """Count a loss at byte `at`."""
         if not self._tally[row, 0]:
             self._tally[row, 1] = at
         self._tally[row, 0] += count
@@ -262,5 +261,5 @@ class Decoder:
 
     @property
     def counts(self) -> dict[str, int]:
-        """The format's own part of `EventSource.counts`."""
+        """The format's part of `EventSource.counts`."""
         return {name: int(self._tally[row, 0]) for name, row in COUNTS.items()}

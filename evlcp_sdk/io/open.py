@@ -15,7 +15,7 @@ from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
 from evlcp_sdk.io.streams import SCHEMES, open_stream
 from evlcp_sdk.io.tables import CsvWriter, NpzWriter
-from evlcp_sdk.io.urls import flag, positive, split_options
+from evlcp_sdk.io.urls import parse_flag, parse_positive, split_options
 from evlcp_sdk.lazy import LazyModule
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
@@ -33,79 +33,79 @@ T = TypeVar("T")
 WRITABLE: Final = {".raw": "EVT3", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV"}
 
 STDIN: Final = "-"
-"""What is opened as standard input."""
+"""Name of standard input."""
 
-_RECORDED: Final = ("", "file", "replay", "list", "bag", "hdf5")
-"""Schemes of what waits for its reader; what else a plugin opens may have a pace of its own."""
+_RECORDING_SCHEMES: Final = ("", "file", "replay", "list", "bag", "hdf5")
+"""Schemes of sources that wait for their reader; others that plugins open may be live."""
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 
 
-def _scheme_of(url: str) -> str:
-    """What stands before the `:` of a name that is no file's; empty for none."""
+def _find_scheme(url: str) -> str:
+    """Return the scheme before the `:` of a name, empty for a file or no scheme."""
     found = _SCHEME.match(url)
     return "" if found is None or is_there(url) else found[1].lower()
 
 
 def is_recording(url: Path | str) -> bool:
-    """Whether a name is that of a recording, by what stands before its `:`."""
-    return str(url) != STDIN and _scheme_of(str(url)) in _RECORDED
+    """Whether a name is that of a recording, by its scheme."""
+    return str(url) != STDIN and _find_scheme(str(url)) in _RECORDING_SCHEMES
 
 
 def open_source(url: Path | str, registry: Registry | None = None) -> EventSource:
     """Open a recording, a stream, a camera or what a plugin knows, as an event source: a context manager.
 
     Plugins are asked first, by the hook `evlcp_open_events`; one that fails is left out, with a
-    `PluginWarning`. Of a file the content says the format, or else the suffix of its name; `file:` before its
-    name does no harm.
+    `PluginWarning`. The format of a file is that of its content, or else of its suffix; `file:` may stand
+    before its name.
 
     Args:
         url: A file, or what a plugin opens, e.g. `cam:0`; `-` for RAW words on standard input,
             `tcp://HOST:PORT`, `udp://HOST:PORT` or `unix:PATH` for those of another program;
-            `replay:REC?speed=1&loop=1` for a recording at the pace of its own clock, again and again;
+            `replay:REC?speed=1&loop=1` for a recording at the speed of its own clock, in a loop;
             `camera:` for a camera by the extra `camera`.
-        registry: The plugins that are asked; None for all that are installed.
+        registry: The plugins to ask; None for all that are installed.
 
     Raises:
-        InputError: It cannot be opened or is not of a known format, or nobody knows its scheme.
+        InputError: It cannot be opened or is not of a known format, or its scheme is unknown.
     """
     registry = Registry.load() if registry is None else registry
     name = str(url)
-    if _scheme_of(name) == "file":
+    if _find_scheme(name) == "file":
         name = unquote(name.partition(":")[2].removeprefix("//"))
-        if name == STDIN or _scheme_of(name):
+        if name == STDIN or _find_scheme(name):
             name = f"./{name}"  # a file's name, whatever it looks like
-    source = _ask(registry, "evlcp_open_events", EventSource, url=name)  # type: ignore[type-abstract]
+    source = _ask_plugins(registry, "evlcp_open_events", EventSource, url=name)  # type: ignore[type-abstract]
     if source is not None:
         return source
     if name == STDIN:
         return _open_stdin()
-    scheme = _scheme_of(name)
+    scheme = _find_scheme(name)
     if not scheme:
         return _open_file(name)
     if scheme == "replay":
         return _open_replay(name, registry)
-    if scheme in _SCHEMES:
-        return _SCHEMES[scheme](name)
+    if scheme in _OPENERS:
+        return _OPENERS[scheme](name)
     asked = sorted(registry.plugins("evlcp_open_events"))
     broken = "".join(f"; {plugin}" for plugin in registry.broken)
     raise InputError(
-        f"{url}: scheme '{scheme}', expected {', '.join(f'{one}:' for one in ('file', 'replay', *_SCHEMES))}"
+        f"{url}: scheme '{scheme}', expected {', '.join(f'{one}:' for one in ('file', 'replay', *_OPENERS))}"
         " or one that a plugin opens"
         f" (asked: {', '.join(asked) or 'no plugin that opens sources is installed'}){broken}"
     )
 
 
-_SCHEMES: Final[dict[str, Callable[[str], EventSource]]] = {
+_OPENERS: Final[dict[str, Callable[[str], EventSource]]] = {
     "list": lambda url: lists.open_list(url),
     "camera": lambda url: camera.open_camera(url),
     **dict.fromkeys(SCHEMES, open_stream),
 }
 
 
-def _ask(registry: Registry, hook: str, kind: type[T], **given: Any) -> T | None:
-    """What the first plugin gives that knows what is asked for; None without. One that fails is left out."""
-    about = str(next(iter(given.values())))
+def _ask_plugins(registry: Registry, hook: str, kind: type[T], **given: Any) -> T | None:
+    """Return the first answer of a plugin's hook, or None; a plugin that fails is left out."""
+    subject = str(next(iter(given.values())))
     for impl in reversed(getattr(registry.hook, hook).get_hookimpls()):
         try:
             answer: object = impl.function(*(given[name] for name in impl.argnames))
@@ -113,18 +113,17 @@ def _ask(registry: Registry, hook: str, kind: type[T], **given: Any) -> T | None
             raise
         except (Exception, SystemExit) as fault:
             what = " ".join(f"{type(fault).__name__}: {fault}".split())
-            registry.leave_out(impl.plugin_name, f"{hook}({about!r}) fails: {what}")
+            registry.leave_out(impl.plugin_name, f"{hook}({subject!r}) fails: {what}")
             continue
         if isinstance(answer, kind):
             return answer
         if answer is not None:
             what = f"gave {type(answer).__name__}, expected an {kind.__name__}"
-            registry.leave_out(impl.plugin_name, f"{hook}({about!r}) {what}")
+            registry.leave_out(impl.plugin_name, f"{hook}({subject!r}) {what}")
     return None
 
 
 def _open_stdin() -> EventSource:
-    """RAW words on standard input: a pipe, which is read once, or a file."""
     name = "standard input"
     try:
         file = io.FileIO(0, closefd=False)
@@ -136,40 +135,40 @@ def _open_stdin() -> EventSource:
 
 
 def _open_replay(url: str, registry: Registry) -> EventSource:
-    """A recording at its own pace: `replay:REC`, with `?speed=`, `loop=` and `for_s=`."""
-    name, options = split_options(url, {"speed": positive, "loop": flag, "for_s": positive})
+    """Open `replay:REC`, with `?speed=`, `loop=` and `for_s=`."""
+    name, options = split_options(url, {"speed": parse_positive, "loop": parse_flag, "for_s": parse_positive})
     inner = name.partition(":")[2]
     if not inner or inner == STDIN:
         raise InputError(f"{url}: expected replay:REC, the name of a recording")
 
-    def opened() -> EventSource:
+    def open_inner() -> EventSource:
         return open_source(inner, registry)
 
     for_s = options.get("for_s", math.inf)
     if for_s < math.inf and not options.get("loop"):
         raise InputError(f"{url}: for_s = {for_s:g}: only with loop=1")
-    again = LoopSource(opened, for_us=for_s * 1e6) if options.get("loop") else opened()
-    if again.live:
-        again.close()
+    recording = LoopSource(open_inner, for_us=for_s * 1e6) if options.get("loop") else open_inner()
+    if recording.live:
+        recording.close()
         raise InputError(f"{url}: {inner} has a pace of its own, expected a recording")
-    return ReplaySource(again, options.get("speed", 1.0))
+    return ReplaySource(recording, options.get("speed", 1.0))
 
 
 def _open_file(name: str) -> EventSource:
-    """Open a RAW file, or a list of events where the content or the name says so."""
+    """Open a RAW file, or a list of events, by its content or its name."""
     path = Path(name)
     suffix = _suffix(path)
     try:
         with path.open("rb") if path.is_file() else nullcontext() as file:
             start = b"" if file is None else file.read(4)
         is_raw = start.startswith(b"% ") and (suffix == ".raw" or suffix not in lists.SUFFIXES)
-        zipped = start.startswith((b"PK\x03\x04", b"\x1f\x8b"))
-        named = suffix in (".csv", ".csv.gz", ".npz")
-        if not is_raw and (zipped or named or (start and lists.is_list(path))):
+        is_zip = start.startswith((b"PK\x03\x04", b"\x1f\x8b"))
+        has_suffix = suffix in (".csv", ".csv.gz", ".npz")
+        if not is_raw and (is_zip or has_suffix or (start and lists.is_list(path))):
             return lists.open_list(path)
     except OSError as error:
         raise InputError(f"{name}: {error.strerror}") from error
-    return RawSource(name)  # which says what is wrong
+    return RawSource(name)
 
 
 def _suffix(path: Path) -> str:
@@ -197,13 +196,13 @@ def open_writer(
     """Create a recording to write piece by piece, a context manager.
 
     Args:
-        path: The file; `.raw`, `.mcap`, `.npz`, `.csv` or `.csv.gz` decides the format.
-        width: Columns of the sensor; RAW and bags need it, the tables do not.
+        path: The file; its suffix is the format: `.raw`, `.mcap`, `.npz`, `.csv` or `.csv.gz`.
+        width: Columns of the sensor; RAW and bags need it, tables do not.
         height: Rows of the sensor, likewise.
         format: `EVT3` (the default for `.raw`), `EVT2`, `BAG` (of ROS 2, by the extra `ros`), `NPZ` or `CSV`,
             whatever the file's name.
-        outputs: The files that it comes into place with; None for alone, as soon as it is closed.
-        registry: The plugins that are asked for other formats; None for all that are installed.
+        outputs: The files that appear together with it; None lets it appear as soon as it is closed.
+        registry: The plugins to ask for other formats; None for all that are installed.
 
     Raises:
         ConfigError: A package that a bag needs is not installed.
@@ -219,7 +218,7 @@ def open_writer(
     if name not in CODECS:
         given = {"path": Path(path), "width": width, "height": height, "format": format or ""}
         registry = Registry.load() if registry is None else registry
-        writer = _ask(registry, "evlcp_open_writer", EventWriter, **given, outputs=outputs)  # type: ignore[type-abstract]
+        writer = _ask_plugins(registry, "evlcp_open_writer", EventWriter, **given, outputs=outputs)  # type: ignore[type-abstract]
         if writer is not None:
             return writer
         found = f"format {format!r}" if format else f"suffix {suffix!r}"
@@ -243,7 +242,7 @@ def write_events(
     triggers: Triggers | None = None,
     format: str | None = None,
 ) -> None:
-    """Save events and triggers, sorted by time, as a recording; arguments as for `open_writer`.
+    """Save events and triggers, sorted by time, as a recording; arguments as of `open_writer`.
 
     Raises:
         OutputError: The file cannot be written.

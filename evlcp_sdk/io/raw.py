@@ -15,7 +15,7 @@ import numpy as np
 from evlcp_sdk.errors import InputError, RawFormatError, StreamError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.io import _kernels
-from evlcp_sdk.io.evt import EVT2, EVT3, MAX_SIDE, Codec, Columns, Decoder
+from evlcp_sdk.io.evt import EVT2, EVT3, MAX_SIDE, Codec, Decoder, EventBuffer
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.plugin.writer import EventWriter
 from evlcp_sdk.values import Events, Triggers, span_us, to_kernel_array
@@ -25,11 +25,11 @@ CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}
 
 MAX_HEADER_BYTES = 1 << 16
 PIPE_BYTES, PIPE_WAIT_S = 1 << 17, 0.1
-"""Bytes of a pipe that are waited for first, and for how long: words enough to tell their encoding."""
+"""Bytes to wait for at the start of a pipe, and how long: enough words to check their encoding."""
 WRITE_WORDS = 1 << 15
 
-# Another encoding read as the declared one has a reserved type in a third of its words or more, and a camera
-# never sends one. An eighth is far from both; and fewer than 16 words are not enough to say.
+# Read as another encoding, a third of the words or more are of a reserved type, which a camera never sends.
+# An eighth is far from both; fewer than 16 words are not enough to tell.
 RESERVED_PROBE_WORDS = 1 << 15
 RESERVED_FIRST_WORDS = 1 << 8
 RESERVED_SHARE = 1 / 8
@@ -39,60 +39,60 @@ RESERVED_LEAST = 16
 TIMELESS_BYTES = 1 << 24
 
 
-class RawBytes(Protocol):
-    """What a `RawSource` reads: a file, a pipe, a socket; one without `fileno` is waited for as a pipe."""
+class ByteReader(Protocol):
+    """What a `RawSource` reads from: a file, a pipe, a socket; without `fileno` it is read as a pipe."""
 
     def readinto(self, room: memoryview, /) -> int | None:
-        """Wait for bytes, put them to the front; how many, 0 at the end."""
+        """Wait for bytes, write them to the front of `room`, and return how many; 0 at the end."""
 
     def close(self) -> None:
-        """Read no more."""
+        """Release the file."""
 
 
-class ChunkBytes(ABC):
-    """Bytes that come in chunks, as a `RawSource` reads them.
+class ChunkReader(ABC):
+    """A `ByteReader` of bytes that come in chunks.
 
     Args:
-        ready: What comes before the first chunk.
+        ready: Bytes before the first chunk.
 
     Attributes:
-        given: Bytes that have been read.
+        bytes_read: Bytes that have been read.
     """
 
     def __init__(self, ready: bytes = b"") -> None:
         self._ready = memoryview(ready)
-        self.given = 0
+        self.bytes_read = 0
 
     @abstractmethod
-    def more(self) -> bytes | memoryview:
-        """Wait for the next chunk; nothing at the end."""
+    def read_chunk(self) -> bytes | memoryview:
+        """Wait for the next chunk; empty at the end."""
 
     @abstractmethod
     def close(self) -> None:
-        """Give no more."""
+        """Release the file; what is read then is empty."""
 
     def readinto(self, room: memoryview, /) -> int:
-        """Wait for bytes, put them to the front; how many, 0 at the end."""
+        """As `ByteReader.readinto`."""
         if not len(self._ready):
-            self._ready = memoryview(self.more())
+            self._ready = memoryview(self.read_chunk())
         size = min(len(room), len(self._ready))
         room[:size] = self._ready[:size]
         self._ready = self._ready[size:]
-        self.given += size
+        self.bytes_read += size
         return size
 
 
 @dataclass(frozen=True)
 class RawHeader:
-    """What the header of a RAW file says.
+    """The header of a RAW file.
 
     Attributes:
         fields: The text of each line by its first word, such as `{"evt": "3.0", "geometry": "1280x720"}`.
-        codec: The encoding of the words behind it.
-        width: Columns of the sensor, or None if no line says so.
-        height: Rows of the sensor, or None if no line says so.
+        codec: The encoding of the words.
+        width: Columns of the sensor, or None if no line states them.
+        height: Rows of the sensor, or None if no line states them.
         size_bytes: Where the words start.
-        closed: Whether it ends with `% end`.
+        closed: Whether the header ends with `% end`.
     """
 
     fields: Mapping[str, str]
@@ -104,14 +104,14 @@ class RawHeader:
 
 
 def parse_header(data: bytes, path: Path | str) -> RawHeader:
-    """Read the header at the start of `data`, the first bytes of the file `path` (64 KiB suffice).
+    """Parse the header in `data`, the first bytes of the file `path` (64 KiB suffice).
 
-    The header ends behind the line `% end`, or else before the first line that does not start with `%`
-    and a space.
+    The header ends after the line `% end`, or else before the first line that does not start with `%` and a
+    space.
 
     Raises:
-        RawFormatError: There is no header, or it does not say the encoding, names one that is not EVT2 or
-            EVT3, or contradicts itself.
+        RawFormatError: There is no header, or it states no encoding or one that is not EVT2 or EVT3, or it
+            contradicts itself.
     """
     if not data:
         raise RawFormatError(path, 0, "an empty file", "a RAW header, '% evt 3.0' or '% evt 2.0'")
@@ -136,7 +136,7 @@ def parse_header(data: bytes, path: Path | str) -> RawHeader:
             fields[key] = value.strip()
             offsets[key] = at
         at = end + 1
-    codec, width, height = _interpret(fields, offsets, path)
+    codec, width, height = _parse_fields(fields, offsets, path)
     return RawHeader(fields, codec, width, height, at, closed)
 
 
@@ -161,14 +161,13 @@ def format_header(codec: Codec, width: int, height: int) -> bytes:
     ).encode()
 
 
-def _interpret(
+def _parse_fields(
     fields: Mapping[str, str], offsets: Mapping[str, int], path: Path | str
 ) -> tuple[Codec, int | None, int | None]:
-    """Return the encoding and the size of the sensor that header lines give."""
+    """Return the encoding and the columns and rows of the sensor by the fields of a header."""
     found: dict[str, tuple[str, Any]] = {}
 
-    def settle(what: str, key: str, value: Any, expected: str) -> None:
-        """Take what a line says, None where it says nothing that is known."""
+    def set_once(what: str, key: str, value: Any, expected: str) -> None:
         line = f"'% {key} {fields[key]}'"
         if value is None:
             raise RawFormatError(path, offsets[key], line, expected)
@@ -184,11 +183,11 @@ def _interpret(
     versions = {codec.version: codec for codec in CODECS.values()}
     for key, text, known in (("format", name, CODECS), ("evt", fields.get("evt", ""), versions)):
         if key in fields:
-            settle("encoding", key, known.get(text), " or ".join(known))
+            set_once("encoding", key, known.get(text), " or ".join(known))
     for key, side, text in sides:
         if side in ("width", "height"):
             value = int(text) if text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_SIDE else None
-            settle(side, key, value, f"a width and a height from 1 to {MAX_SIDE}")
+            set_once(side, key, value, f"a width and a height from 1 to {MAX_SIDE}")
     if "encoding" not in found:
         listed = ", ".join(fields)
         raise RawFormatError(path, 0, f"a header without encoding ({listed})", "a line '% evt 3.0'")
@@ -196,30 +195,29 @@ def _interpret(
 
 
 class RawSource(EventSource):
-    """A RAW file, read with one buffer of fixed size; of a pipe what is there is given out at once.
+    """A RAW file, read through one buffer of fixed size; of a pipe each piece is what has arrived.
 
     Args:
-        path: The file.
-        file: What is read if it is open already, without a buffer of its own; `path` is then what faults
-            call it.
+        path: The file, or the name of `file` in error messages.
+        file: The open file, without a buffer; None opens `path`.
 
     Raises:
         InputError: The file cannot be opened.
-        RawFormatError: Its header is not one, or its words are of another encoding than the header says.
+        RawFormatError: It has no valid header, or its words are of another encoding than the header states.
     """
 
     _gives_bits = True
 
-    def __init__(self, path: Path | str, file: RawBytes | None = None) -> None:
+    def __init__(self, path: Path | str, file: ByteReader | None = None) -> None:
         self.path = Path(path)
-        self._buffer = np.empty(2 * _kernels.LOOK_BYTES, np.uint8)
+        self._buffer = np.empty(2 * _kernels.LOOKAHEAD_BYTES, np.uint8)
         self._position = 0  # byte offset in the file of the first byte not decoded
         self._start = self._end = 0  # the bytes of the buffer not decoded
         self._exhausted = False
         try:
-            self._file: RawBytes = self.path.open("rb", buffering=0) if file is None else file
-            self._number: int | None = getattr(self._file, "fileno", lambda: None)()
-            status = None if self._number is None else os.fstat(self._number)
+            self._file: ByteReader = self.path.open("rb", buffering=0) if file is None else file
+            self._descriptor: int | None = getattr(self._file, "fileno", lambda: None)()
+            status = None if self._descriptor is None else os.fstat(self._descriptor)
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}") from error
         self._is_pipe = status is None or not stat.S_ISREG(status.st_mode)
@@ -232,30 +230,30 @@ class RawSource(EventSource):
             shape = header.width, header.height
             super().__init__(self.path, header.codec.name, *shape, header.fields, size, self._decoder)
             if not header.closed:
-                self._decoder.note(_kernels.HEADER_OPEN, header.size_bytes)
+                self._decoder.count_loss(_kernels.HEADER_OPEN, header.size_bytes)
             self._start = self._position = self._data_start = header.size_bytes
             self._fill(0)
-            if self._is_pipe and not self._exhausted and self._number is not None:
-                self._wait_a_little(self._number)
-            self._probe()
+            if self._is_pipe and not self._exhausted and self._descriptor is not None:
+                self._fill_from_pipe(self._descriptor)
+            self._check_encoding()
         except BaseException:
             self._file.close()
             raise
 
     def _fill_header(self) -> None:
-        """Read until the header is there; of a file all that there is room for."""
+        """Read until the header is complete; of a file as much as there is room for."""
         while not self._exhausted and self._end < MAX_HEADER_BYTES:
             self._fill()
             start = self._buffer[: self._end].tobytes()
             lines = start.split(b"\n")
-            # Where the last line is whole, another line of the header may come.
+            # After a complete line another line of the header may come.
             if b"% end" in (line.rstrip(b"\r") for line in lines[:-1]) or any(
                 len(line) > 1 and not line.startswith(b"% ") for line in lines
             ):
                 return
 
-    def _wait_a_little(self, number: int) -> None:
-        """Read what of a pipe comes soon, enough to tell its encoding: in the dark little comes."""
+    def _fill_from_pipe(self, number: int) -> None:
+        """Wait a little for words enough to check the encoding; in the dark few come."""
         until_s = time.monotonic() + PIPE_WAIT_S
         ready = select.poll()
         ready.register(number, select.POLLIN)
@@ -265,12 +263,12 @@ class RawSource(EventSource):
                 return
             self._fill()
 
-    def _probe(self) -> None:
-        """Raise RawFormatError if the first words look like another encoding."""
-        words = self._words()[:RESERVED_PROBE_WORDS]
-        reserved = self._codec.reserved(words)
+    def _check_encoding(self) -> None:
+        """Raise a RawFormatError if the first words look like another encoding."""
+        words = self._get_words()[:RESERVED_PROBE_WORDS]
+        reserved = self._codec.find_reserved(words)
         share = np.count_nonzero(reserved) / max(len(words), 1)
-        # Where the first ones are as they should be, and later ones are not, bytes are missing: not here.
+        # If only later words are wrong, bytes are missing, which the decoder handles.
         first = reserved[:RESERVED_FIRST_WORDS].mean() if len(words) else 0.0
         if min(share, first) > RESERVED_SHARE and share * len(words) >= RESERVED_LEAST:
             raise RawFormatError(
@@ -281,9 +279,9 @@ class RawSource(EventSource):
             )
 
     def _fill(self, least: int = 1) -> None:
-        """Move what is left to the front of the buffer and read on until it is full or the file ends.
+        """Move the rest to the front of the buffer, where words are aligned, and read until it is full.
 
-        Of a pipe until `least` bytes more are there. The bytes that are left are in line with words again.
+        Of a pipe it reads until `least` more bytes are there.
         """
         left = self._end - self._start
         self._buffer[:left] = self._buffer[self._start : self._end]
@@ -298,26 +296,26 @@ class RawSource(EventSource):
             self._exhausted = not size
             self._end += size or 0
 
-    def _words(self) -> np.ndarray[tuple[int], np.dtype[np.unsignedinteger]]:
-        """Return the whole words in the buffer."""
+    def _get_words(self) -> np.ndarray[tuple[int], np.dtype[np.unsignedinteger]]:
+        """Return the complete words in the buffer."""
         size = self._codec.word.itemsize
         count = (self._end - self._start) // size
         return self._buffer[self._start : self._start + count * size].view(self._codec.word)
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """As `EventSource.take`; where no word gives a time, a RawFormatError."""
-        out = Columns(max(max_events, self._codec.burst), max(max_events // 16, 1024))
+        """As `EventSource.take`; words without any time raise a RawFormatError."""
+        out = EventBuffer(max(max_events, self._codec.burst), max(max_events // 16, 1024))
         if self._decode_into(out) and not out.events and not out.triggers:
             return None
-        return out.taken()
+        return out.get_filled()
 
-    def _decode_into(self, out: Columns) -> bool:
-        """Decode until `out` is full, and return False, or to the end of the file, and return True.
+    def _decode_into(self, out: EventBuffer) -> bool:
+        """Decode until `out` is full or the file ends; return whether it has ended.
 
-        Of a pipe until there is something and more would have to be waited for.
+        Of a pipe it also stops as soon as it has something and would have to wait for more.
         """
         while out.events <= out.room - self._codec.burst and out.triggers < out.trigger_room:
-            words = self._words()
+            words = self._get_words()
             if not len(words):
                 if self._exhausted:
                     self._finish()
@@ -368,13 +366,13 @@ class RawEncoder:
         self._codec = codec
         self._state = np.full(3, -1, np.int64)
         self._words = np.empty(WRITE_WORDS, codec.word)
-        self._begun = False
+        self._started = False
 
     def encode(self, events: Events, triggers: Triggers) -> Iterator[bytes]:
-        """Yield the words of the next events and triggers, none of which is before the last ones."""
-        if not self._begun and (len(events) or len(triggers)):
-            self._begun = True
-            words, self._state[0] = self._codec.prelude(span_us(events, triggers)[0])
+        """Yield the words of the next events and triggers, none of them earlier than those before."""
+        if not self._started and (len(events) or len(triggers)):
+            self._started = True
+            words, self._state[0] = self._codec.encode_prelude(span_us(events, triggers)[0])
             yield words.tobytes()
         event_columns = tuple(to_kernel_array(c) for c in (events.t_us, events.x, events.y, events.p))
         trigger_columns = tuple(to_kernel_array(c) for c in (triggers.t_us, triggers.channel, triggers.value))
@@ -385,18 +383,17 @@ class RawEncoder:
 
 
 class RawWriter(EventWriter):
-    """A RAW file being written, in the words of a codec, `EVT3` or `EVT2`.
+    """Writes a RAW file in the words of a codec, `EVT3` or `EVT2`.
 
-    What is read back is what was written, in the same order, triggers too. Where triggers share their time
-    with events, they come first.
+    It reads back as it was written, in the same order; triggers at the time of events come first.
 
     Raises:
         OutputError: The file cannot be written.
         StreamError: The sensor is larger than the words can address.
     """
 
-    # A word does not say how often the clock has rolled over. Before a first time beyond its range (EVT3:
-    # 16.8 s) the writer lets it roll over that often; this keeps those words below 2 MB.
+    # Words do not state how often the clock has rolled over. Before a first time beyond its range (EVT3: 16.8
+    # s) the writer lets it roll over that often; this limit keeps those words below 2 MB.
     times_us = (0, (1 << 40) - 1)
 
     def __init__(

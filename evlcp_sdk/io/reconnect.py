@@ -1,4 +1,4 @@
-"""A source that is opened again when it is gone: a camera that was unplugged, a stream whose sender left."""
+"""Open a source again when it is gone: a camera that was unplugged, a stream whose sender left."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -10,19 +10,18 @@ from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.signals import Stopped
 from evlcp_sdk.values import Events, Triggers
 
-_EVERY_S: Final = 0.5
-"""How often it is tried."""
+_RETRY_S: Final = 0.5
 
 
 class ReconnectingSource(WrappingSource):
-    """A live source, opened again and again when it ends or fails, until stopped.
+    """A live source that is reopened whenever it ends or fails, until stopped.
 
-    Its clock may begin anew with each opening; a receiver takes that for a restart of the camera's clock.
+    Its clock may start anew each time; to a receiver that is a restart of the camera's clock.
 
     Args:
-        opened: Opens it.
-        stopped: Whether to give up.
-        sleep: Waits, s.
+        opener: Opens the source.
+        stopped: Returns whether to give up.
+        sleep: Waits so many seconds.
 
     Raises:
         InputError: It cannot be opened the first time.
@@ -31,29 +30,29 @@ class ReconnectingSource(WrappingSource):
     live = True
 
     def __init__(
-        self, opened: Callable[[], EventSource], stopped: Stopped, sleep: Callable[[float], None] = time.sleep
+        self, opener: Callable[[], EventSource], stopped: Stopped, sleep: Callable[[float], None] = time.sleep
     ) -> None:
-        super().__init__(opened())
-        self._opened, self._stopped, self._sleep = opened, stopped, sleep
+        super().__init__(opener())
+        self._opener, self._stopped, self._sleep = opener, stopped, sleep
         self._reconnects = 0
         self._closed = False
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """As of the source; waits while it is gone."""
+        """As `EventSource.take`; waits while the source is gone."""
         while True:
             try:
                 piece = next(self._source.stream(max_events), None)
             except InputError:
                 piece = None
-            if piece is not None or not self._is_back():
+            if piece is not None or not self._reconnect():
                 return piece
 
-    def _is_back(self) -> bool:
+    def _reconnect(self) -> bool:
         while not self._stopped() and not self._closed:
             try:
-                self._replace(self._opened)
+                self._reopen(self._opener)
             except InputError:
-                self._sleep(_EVERY_S)
+                self._sleep(_RETRY_S)
                 continue
             self._reconnects += 1
             return True
@@ -61,7 +60,7 @@ class ReconnectingSource(WrappingSource):
 
     @property
     def health(self) -> Mapping[str, float | int | str]:
-        """As of the source, with `reconnects`."""
+        """The health of the source, with `reconnects`."""
         return {**self._source.health, "reconnects": self._reconnects}
 
     @property
@@ -70,6 +69,6 @@ class ReconnectingSource(WrappingSource):
         return super().counts | {"reconnects": self._reconnects}
 
     def close(self) -> None:
-        """Open it no more, and let it go."""
+        """Close the source and stop reopening it."""
         self._closed = True
         super().close()

@@ -1,4 +1,4 @@
-"""A recording given out at the pace of its own clock."""
+"""Replay a recording at the speed of its own clock, once or in a loop."""
 
 import math
 import time
@@ -11,80 +11,80 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.values import Events, Triggers, span_us
 
-SEAM_US = 500_000
-"""Dark time between a recording's end and its next pass: what was seen is forgotten, no clock leaps."""
+LOOP_GAP_US = 500_000
+"""Pause between two passes of a recording: a receiver forgets what it saw, but sees no clock leap."""
 
 DAMAGE_US = 100_000
-"""Silence beside damage that is taken for damage too: a wrong TIME_HIGH steps by up to 2^24 us, and so does
-the clock behind it, while the noise of its pixels alone keeps a sensor from being silent for so long."""
+"""A longer silence next to damage is damage too: a wrong TIME_HIGH steps the clock by up to 2^24 us, while
+the noise of its pixels keeps a sensor from being silent for so long."""
 
 
 class WrappingSource(EventSource):
-    """A source that gives out what another gives, which it closes.
+    """A source that passes on what another one gives, and closes it.
 
     Args:
-        source: The other, as it is at first.
-        size_bytes: Size of its file; None where it is opened again.
+        source: The other source.
+        size_bytes: Size of its file; None if it will be reopened.
     """
 
     def __init__(self, source: EventSource, size_bytes: int | None = None) -> None:
         super().__init__(source.path, source.format, source.width, source.height, source.header, size_bytes)
         self.guessed, self.step_us = source.guessed, source.step_us
         self._source = source
-        self._lost: dict[str, Loss] = {}
+        self._past_losses: dict[str, Loss] = {}
 
-    def _replace(self, opened: Callable[[], EventSource]) -> None:
-        """Open another one instead; what was lost stays counted."""
+    def _reopen(self, opener: Callable[[], EventSource]) -> None:
+        """Replace the source by one newly opened; past losses stay counted."""
         self._source.close()
-        source = opened()
-        self._lost, self._source = self.losses, source
+        source = opener()
+        self._past_losses, self._source = self.losses, source
 
     def clock_s(self, t_us: float) -> float | None:
-        """As of the other."""
+        """As `EventSource.clock_s`, of the wrapped source."""
         return self._source.clock_s(t_us)
 
     @property
     def losses(self) -> dict[str, Loss]:
-        """As of the other, those before it was opened again too."""
-        return Loss.added(self._lost, self._source.losses)
+        """The losses of the source since it was first opened."""
+        return Loss.added(self._past_losses, self._source.losses)
 
     def close(self) -> None:
-        """Close the other."""
+        """Close the source."""
         self._source.close()
 
 
 class LoopSource(WrappingSource):
-    """A recording again and again, its clock going on.
+    """A recording in a loop, its clock going on.
 
     Args:
-        opened: Opens the recording.
-        for_us: Ends with the pass in which so much time is over, us; None: never.
+        opener: Opens the recording.
+        for_us: Ends with the pass that reaches this time, us.
     """
 
-    def __init__(self, opened: Callable[[], EventSource], for_us: float = math.inf) -> None:
-        super().__init__(opened())
+    def __init__(self, opener: Callable[[], EventSource], for_us: float = math.inf) -> None:
+        super().__init__(opener())
         self.live = self._source.live
-        self._opened, self._for_us = opened, for_us
+        self._opener, self._for_us = opener, for_us
         self._shift_us = 0
         self._start_us: int | None = None
         self._last_us = 0
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """As of the recording, with the times of this pass."""
+        """As `EventSource.take`, with the times of this pass."""
         piece = next(self._source.stream(max_events), None)
-        begins = self._start_us is None
+        is_first = self._start_us is None
         while piece is None:
             if self._start_us is None or self._last_us - self._start_us >= self._for_us:
                 return None  # It is empty, or over.
-            self._replace(self._opened)
-            begins = True
+            self._reopen(self._opener)
+            is_first = True
             piece = next(self._source.stream(max_events), None)
         events, triggers = piece
         first_us, last_us = span_us(events, triggers)
         if self._start_us is None:
             self._start_us = first_us
-        elif begins:
-            self._shift_us = self._last_us + SEAM_US - first_us
+        elif is_first:
+            self._shift_us = self._last_us + LOOP_GAP_US - first_us
         self._last_us = last_us + self._shift_us
         if not self._shift_us:
             return piece
@@ -95,18 +95,18 @@ class LoopSource(WrappingSource):
 
 
 class ReplaySource(WrappingSource):
-    """A recording given out at the pace of its own clock, as a camera would.
+    """A recording replayed at the speed of its own clock, as a camera would send it.
 
-    A silence is waited for, but not one of over `DAMAGE_US` in a piece of the recording with losses, or next
-    to one: its clock has leapt there. `counts` has how many, and their time, as `silences_skipped` and
+    Silences last as long as they did, except those over `DAMAGE_US` in or next to a piece of the recording
+    with losses, where its clock has leapt. `counts` has their number as `silences_skipped`, and their time as
     `silences_skipped_us`.
 
     Args:
         source: The recording; closed with the replay.
-        speed: Camera seconds for each second that passes.
-        slice_us: Camera time between two pieces, us; each comes when its time is over.
-        clock: Gives the time, s.
-        sleep: Waits, s.
+        speed: Camera seconds per second.
+        slice_us: Camera time of a piece, us; it comes when that time is over.
+        clock: Returns the time, s.
+        sleep: Waits so many seconds.
 
     Raises:
         StreamError: `speed` or `slice_us` is not positive.
@@ -130,24 +130,24 @@ class ReplaySource(WrappingSource):
         self._clock = clock
         self._sleep = sleep
         self._piece = (Events.empty(), Triggers.empty())
-        self._last_us: int | None = None  # of what was given out
-        self._damages = 0
-        self._damaged = False  # this piece of the recording
-        # Camera clock, us, and own clock, s: of the first piece and of each after a silence that was skipped.
+        self._last_us: int | None = None  # the last time that was replayed
+        self._past_damage = 0
+        self._is_damaged = False  # this piece of the recording
+        # Camera clock, us, and own clock, s, of the first piece and of each after a skipped silence.
         self._origins: list[tuple[int, float]] = []
         self._skipped = {"silences_skipped": 0, "silences_skipped_us": 0}
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         """Wait until the next slice of time is over and return its events, at most `max_events`."""
-        damaged = self._damaged
+        damaged = self._is_damaged
         if not any(len(half) for half in self._piece):
             piece = next(self._source.stream(max_events), None)
             if piece is None:
                 return None
             self._piece = piece
             lost = sum(loss.count for loss in self._source.losses.values())
-            self._damaged, self._damages = lost > self._damages, lost
-            damaged |= self._damaged
+            self._is_damaged, self._past_damage = lost > self._past_damage, lost
+            damaged |= self._is_damaged
         events, triggers = self._piece
         first, _ = span_us(events, triggers)
         if self._last_us is None:
@@ -168,7 +168,7 @@ class ReplaySource(WrappingSource):
         return events[:n], triggers[:m]
 
     def clock_s(self, t_us: float) -> float | None:
-        """When a time of the recording is due, by the clock given; None before the first piece."""
+        """Return when a time of the recording is due, by `clock`; None before the first piece."""
         if not self._origins:
             return None
         at = bisect_right(self._origins, t_us, key=lambda origin: origin[0])
@@ -177,11 +177,11 @@ class ReplaySource(WrappingSource):
 
     @property
     def position_bytes(self) -> int:
-        """As the recording's."""
+        """How much of the recording is read."""
         return self._source.position_bytes
 
     @property
     def counts(self) -> dict[str, int]:
-        """As the recording's, with the events and triggers replayed and the silences skipped so far."""
+        """The recording's counts, with the events and triggers replayed and the silences skipped so far."""
         skipped = self._skipped if self._skipped["silences_skipped"] else {}
         return self._source.counts | self._given | skipped

@@ -5,35 +5,35 @@ from typing import Final
 from urllib.parse import urlsplit
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.raw import CODECS, ChunkBytes, RawSource, format_header
-from evlcp_sdk.io.urls import sides, split_options
+from evlcp_sdk.io.raw import CODECS, ChunkReader, RawSource, format_header
+from evlcp_sdk.io.urls import parse_size, split_options
 from evlcp_sdk.plugin.source import EventSource
 
 SCHEMES: Final = ("tcp", "udp", "unix")
-"""Those that `open_stream` opens."""
+"""Schemes that `open_stream` opens."""
 
 _CONNECT_S: Final = 5.0
-_LOOK_S: Final = 0.2
-"""How often a read looks whether it was closed by another thread."""
+_POLL_S: Final = 0.2
+"""How often a read checks whether another thread has closed it."""
 
 _DATAGRAM_BYTES: Final = 1 << 16
 _KERNEL_BYTES: Final = 1 << 22
-"""Bytes that the kernel is asked to hold for us: 10 ms of the most that a camera sends."""
+"""The kernel's receive buffer: 10 ms of the most that a camera sends."""
 
 
-def _encoding(text: str) -> str:
-    named = {"2": "EVT2", "3": "EVT3", "2.0": "EVT2", "3.0": "EVT3"} | {name.lower(): name for name in CODECS}
-    if text.lower() not in named:
+def _parse_encoding(text: str) -> str:
+    names = {"2": "EVT2", "3": "EVT3", "2.0": "EVT2", "3.0": "EVT3"} | {name.lower(): name for name in CODECS}
+    if text.lower() not in names:
         raise ValueError("2 or 3")
-    return named[text.lower()]
+    return names[text.lower()]
 
 
-class SocketBytes(ChunkBytes):
-    """What a socket receives; of a stream without a header one is put before.
+class SocketReader(ChunkReader):
+    """The bytes that a socket receives, behind a header if they come without one.
 
     Args:
-        sock: The socket, connected, or bound where it is of datagrams.
-        header: Put before what comes, where that has none.
+        sock: The socket: a connected stream, or a bound datagram socket.
+        header: The header to prepend.
     """
 
     def __init__(self, sock: socket.socket, header: bytes = b"") -> None:
@@ -43,14 +43,14 @@ class SocketBytes(ChunkBytes):
         self._datagrams = sock.type == socket.SOCK_DGRAM
         self._first = True
         self._closed = False
-        sock.settimeout(_LOOK_S)
+        sock.settimeout(_POLL_S)
 
     def fileno(self) -> int:
-        """Of the socket."""
+        """Return the descriptor of the socket."""
         return self._socket.fileno()
 
-    def more(self) -> bytes:
-        """Wait for bytes; nothing at the end, or once it is closed.
+    def read_chunk(self) -> bytes:
+        """Wait for bytes; return none at the end, or once the socket is closed.
 
         Raises:
             OSError: The connection has failed.
@@ -64,7 +64,7 @@ class SocketBytes(ChunkBytes):
                 if self._closed:
                     return b""
                 raise
-            # Of datagrams one is empty now and then, and a header comes again and again.
+            # Some datagrams are empty, and some repeat the header.
             if self._datagrams and (not data or (not self._first and data.startswith(b"% evt "))):
                 continue
             bare = self._first and data and not data.startswith(b"% ")
@@ -72,7 +72,7 @@ class SocketBytes(ChunkBytes):
             return self._header + data if bare else data
 
     def close(self) -> None:
-        """Let the connection go; a read in another thread ends soon."""
+        """Close the connection; a read in another thread ends soon."""
         self._closed = True
         self._socket.close()
 
@@ -84,44 +84,44 @@ class StreamSource(RawSource):
 
 
 def open_stream(url: str) -> EventSource:
-    """Open `tcp://HOST:PORT`, `udp://HOST:PORT` (which listens there) or `unix:PATH`: RAW words.
+    """Open RAW words from `tcp://HOST:PORT`, `udp://HOST:PORT` (listens there) or `unix:PATH`.
 
-    A stream that starts with a RAW file's header says what it is. For others `?evt=3` (the default of UDP) or
-    `?evt=2`, and `&size=1280x720`.
+    A stream without a RAW file's header takes the options `?evt=3` (the default of UDP) or `?evt=2`, and
+    `&size=1280x720`.
 
     Raises:
-        InputError: Nobody is there, the name is not of this kind, or what comes is not RAW.
+        InputError: Nobody sends there, the name has another form, or the bytes are not RAW.
     """
-    named, options = split_options(url, {"evt": _encoding, "size": sides})
+    named, options = split_options(url, {"evt": _parse_encoding, "size": parse_size})
     scheme = named.partition(":")[0].lower()
     header = b""
     if options or scheme == "udp":
         width, height = options.get("size", (1280, 720))
         header = format_header(CODECS[options.get("evt", "EVT3")], width, height)
     try:
-        sock = _connected(scheme, named)
+        sock = _open_socket(scheme, named)
     except OSError as fault:
         what = fault.strerror or str(fault) or type(fault).__name__
-        raise InputError(f"{url}: {what}; {_NEXT[scheme]}") from fault
-    return StreamSource(url, file=SocketBytes(sock, header))
+        raise InputError(f"{url}: {what}; {_HINTS[scheme]}") from fault
+    return StreamSource(url, file=SocketReader(sock, header))
 
 
-_NEXT: Final = {
+_HINTS: Final = {
     "tcp": "expected a program that sends there, such as: evlcp serve REC.raw --tcp PORT",
     "udp": "expected an address of this machine and a port that is free, e.g. udp://0.0.0.0:5600",
     "unix": "expected a socket that a program listens on",
 }
 
 
-def _connected(scheme: str, url: str) -> socket.socket:
+def _open_socket(scheme: str, url: str) -> socket.socket:
     if scheme == "tcp":
-        sock = socket.create_connection(_address(url), _CONNECT_S)
+        sock = socket.create_connection(_parse_address(url), _CONNECT_S)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BYTES)
         return sock
     if scheme == "unix":
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     else:
-        address = _address(url)
+        address = _parse_address(url)
         sock = socket.socket(socket.AF_INET6 if ":" in address[0] else socket.AF_INET, socket.SOCK_DGRAM)
     try:
         if scheme == "unix":
@@ -136,11 +136,11 @@ def _connected(scheme: str, url: str) -> socket.socket:
     return sock
 
 
-def _address(url: str) -> tuple[str, int]:
-    """Host and port of a URL.
+def _parse_address(url: str) -> tuple[str, int]:
+    """Return the host and port of a URL.
 
     Raises:
-        InputError: There is no port in it, or 0, which nobody could send to.
+        InputError: It has no port, or port 0.
     """
     parts = urlsplit(url)
     try:

@@ -1,4 +1,4 @@
-"""Tables of events: NPZ with one array a column, and CSV, plain or gzipped."""
+"""Write tables of events: NPZ with one array a column, and CSV, plain or gzipped."""
 
 import gzip
 import shutil
@@ -37,9 +37,9 @@ BUFFER_BYTES = 1 << 20
 
 
 class NpzWriter(EventWriter):
-    """An NPZ file being written, with the arrays `COLUMNS` and `TRIGGER_COLUMNS`; not compressed.
+    """Writes an uncompressed NPZ file of the arrays `COLUMNS` and `TRIGGER_COLUMNS`.
 
-    The columns grow in temporary files and are put together at the end.
+    The columns grow in temporary files and are joined at the end.
     """
 
     def _begin(self) -> None:
@@ -81,7 +81,7 @@ class NpzWriter(EventWriter):
 
 
 class CsvWriter(EventWriter):
-    """A CSV file being written; gzipped if its name ends in `.gz`. It has no place for triggers or a size."""
+    """Writes a CSV file, gzipped if its name ends in `.gz`, without triggers and the sensor's size."""
 
     def _begin(self) -> None:
         self._out: IO[bytes] | gzip.GzipFile = self._file

@@ -7,7 +7,7 @@ from typing import Final
 
 from evlcp_sdk.errors import OutputError
 from evlcp_sdk.io.evt import EVT3
-from evlcp_sdk.io.patience import pieces_until
+from evlcp_sdk.io.interruptible import stream_until_stopped
 from evlcp_sdk.io.raw import RawEncoder, format_header
 from evlcp_sdk.live.publisher import Publisher, Subscription
 from evlcp_sdk.plugin.source import EventSource
@@ -85,7 +85,7 @@ class Sender:
             InputError: The source cannot be read on.
         """
         try:
-            for events, triggers in pieces_until(self._source, stopped):
+            for events, triggers in stream_until_stopped(self._source, stopped):
                 self.counts["events"] += len(events)
                 self._publisher.publish("events", 0.0, (events, triggers))
                 if stopped():

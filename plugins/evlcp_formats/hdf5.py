@@ -9,10 +9,10 @@ from typing import Any, Final
 import numpy as np
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.arrays import Array, choose_columns, pieces_of
-from evlcp_sdk.io.columns import WINDOW_US, ColumnSource, EventTable, one_line
-from evlcp_sdk.io.fields import Fields, fields_of, unit_named
-from evlcp_sdk.io.urls import flag, split_options
+from evlcp_sdk.io.arrays import Array, choose_columns, split_pieces
+from evlcp_sdk.io.columns import WINDOW_US, ColumnSource, EventTable, format_error
+from evlcp_sdk.io.fields import Fields, fields_from_names, parse_unit
+from evlcp_sdk.io.urls import parse_flag, split_options
 from evlcp_sdk.lazy import LazyModule
 
 h5py: Any = LazyModule("h5py")
@@ -37,7 +37,7 @@ def open_hdf5(url: str) -> ColumnSource:
     """
     name, options = url, dict[str, Any]()
     if url.startswith("hdf5:"):
-        name, options = split_options(url, {"columns": _order, "unit": unit_named, "swapped": flag})
+        name, options = split_options(url, {"columns": _order, "unit": parse_unit, "swapped": parse_flag})
         name = name.removeprefix("hdf5:")
 
     def opened(path: Path, stack: ExitStack) -> EventTable:
@@ -68,10 +68,10 @@ def _read(path: Path, stack: ExitStack, order: Fields | None, swapped: bool) -> 
         raise InputError(f"{path}: needs the extra: pip install 'evlcp-sdk[hdf5]'") from fault
     except Exception as fault:
         # A damaged file makes h5py fail in any way.
-        raise InputError(f"{path}: found no HDF5 file, or a damaged one ({one_line(fault)})") from fault
+        raise InputError(f"{path}: found no HDF5 file, or a damaged one ({format_error(fault)})") from fault
     if swapped:
         columns[2:] = columns[:1:-1]
-    pieces = pieces_of(columns, path.stat().st_size)
+    pieces = split_pieces(columns, path.stat().st_size)
     return EventTable("HDF5", pieces, found.unit, size=(width, height), window_us=WINDOW_US)
 
 
@@ -101,7 +101,7 @@ class _DataSet:
                 block = np.asarray(self._dataset[:, key].T if self._on_its_side else self._dataset[key])
             except Exception as fault:
                 raise InputError(
-                    f"{self._path}: row {(key.start or 0) + 1}: damaged: {one_line(fault)}"
+                    f"{self._path}: row {(key.start or 0) + 1}: damaged: {format_error(fault)}"
                 ) from fault
             self._held[:] = key, block
         return self._held[1][self._part]
@@ -115,7 +115,7 @@ def _columns_of(path: Path, file: Any, order: Fields | None) -> tuple[list[Array
     listed = ", ".join(names) or "no fields"
     if order is not None and names:
         raise InputError(f"{path}: {at} has {listed}: columns= is for tables without names")
-    if (names or is_group) and fields_of(names) is None:
+    if (names or is_group) and fields_from_names(names) is None:
         raise InputError(f"{path}: {at} has {listed}, expected x, y, p and t")
     if is_group:
         return choose_columns(path, names, lambda name: _DataSet(path, node[name]), None)
@@ -134,7 +134,7 @@ def _place_of(path: Path, file: Any) -> tuple[str, Any]:
         if node is not None:
             return f"/{place}", node
     own = [name for name in file if _is_own(file, name)]
-    if fields_of(own) is not None:
+    if fields_from_names(own) is not None:
         return "/", file
     tables = [name for name in own if isinstance(file[name], h5py.Dataset)]
     if len(tables) == 1:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.arrays import choose_columns, pieces_of, upright
-from evlcp_sdk.io.columns import ColumnSource, EventTable, one_line
+from evlcp_sdk.io.arrays import choose_columns, split_pieces, to_upright
+from evlcp_sdk.io.columns import ColumnSource, EventTable, format_error
 from evlcp_sdk.io.fields import Fields
 from evlcp_sdk.io.lists import open_list
 
@@ -28,7 +28,7 @@ def _read(path: Path, _: ExitStack, fields: Fields | None) -> EventTable:
     """The list of events in a file."""
     arrays = _arrays(path)
     columns, found = choose_columns(path, list(arrays), arrays.__getitem__, fields)
-    return EventTable("MAT", pieces_of(columns, path.stat().st_size), found.unit)
+    return EventTable("MAT", split_pieces(columns, path.stat().st_size), found.unit)
 
 
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -46,7 +46,7 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
         raise
     except Exception as error:
         # A damaged file makes SciPy fail in any way.
-        raise InputError(f"{path}: found no MAT file, expected one ({one_line(error)})") from error
+        raise InputError(f"{path}: found no MAT file, expected one ({format_error(error)})") from error
 
     arrays: dict[str, NDArray[Any]] = {}
 
@@ -55,7 +55,7 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
             if isinstance(value, Mapping):
                 collect(value)
             elif not name.startswith("__") and isinstance(value, np.ndarray) and value.dtype.kind in "biufU":
-                arrays.setdefault(name, upright(value))
+                arrays.setdefault(name, to_upright(value))
 
     collect(found)
     return arrays

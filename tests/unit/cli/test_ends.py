@@ -101,7 +101,7 @@ def test_a_fault_of_ours_says_what_to_report_and_too_little_memory_is_none(
     def broken(*_: object) -> None:
         raise fault
 
-    monkeypatch.setattr(evlcp_sdk.io.describe, "describe", broken)
+    monkeypatch.setattr(evlcp_sdk.io.describe, "describe_source", broken)
     done = evlcp("info", demo_raw)
     first, *parts = said.split("|")
     assert done.code == code

@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.io import RawWriter, open_source, read_events, write_events
-from evlcp_sdk.io.evt import Columns, Decoder
+from evlcp_sdk.io.evt import Decoder, EventBuffer
 from evlcp_sdk.io.raw import CODECS
 from evlcp_sdk.values import Events, Triggers
 
@@ -55,11 +55,11 @@ def decode(name, words, splits, capacity=64, at=0):
     for stop in edges[1:]:
         used = 1
         while start < stop and used:
-            out = Columns(capacity, 3)
+            out = EventBuffer(capacity, 3)
             used = decoder.decode(words[start:stop], at + start * words.itemsize, out, stop == len(words))
             start += used // words.itemsize
-            events.append(out.taken()[0])
-            triggers.append(out.taken()[1])
+            events.append(out.get_filled()[0])
+            triggers.append(out.get_filled()[1])
     assert start == len(words)
     decoder.finish(at + words.nbytes, 0)
     return Events.concat(events), Triggers.concat(triggers), decoder

@@ -7,7 +7,7 @@ import pytest
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import open_source, read_events
-from evlcp_sdk.io.fields import fields_of, time_unit
+from evlcp_sdk.io.fields import fields_from_names, infer_time_unit
 from evlcp_sdk.values import Events
 from tests.unit.io.writers import (
     records,
@@ -306,10 +306,10 @@ def test_a_last_line_that_is_cut_is_left_out_and_counted(tmp_path):
 
 
 def test_names_that_do_not_tell():
-    assert fields_of(["t", "x", "y"]) is None
-    assert fields_of(["t_frame", "p"]) is None
-    fields = fields_of(["timestamp_ms", "t", "sign", "p"])
-    assert fields.which == (1, 3)
+    assert fields_from_names(["t", "x", "y"]) is None
+    assert fields_from_names(["t_frame", "p"]) is None
+    fields = fields_from_names(["timestamp_ms", "t", "sign", "p"])
+    assert fields.numbers == (1, 3)
 
 
 @pytest.mark.parametrize(
@@ -323,4 +323,4 @@ def test_names_that_do_not_tell():
     ],
 )
 def test_few_times_say_their_unit(times, unit):
-    assert time_unit(times, None).name == unit
+    assert infer_time_unit(times, None).name == unit

@@ -11,7 +11,7 @@ import pytest
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import LoopSource, StreamSource, open_source, write_events
-from evlcp_sdk.io.streams import SocketBytes
+from evlcp_sdk.io.streams import SocketReader
 from evlcp_sdk.values import Events
 
 EVENTS = Events.of(np.arange(3000) * 7, np.arange(3000) % 640, np.arange(3000) % 480, np.arange(3000) % 2)
@@ -102,7 +102,7 @@ def test_datagrams_are_read_as_they_come(recording):
 def test_a_read_ends_when_the_source_is_closed(recording):
     ours, theirs = socket.socketpair()
     theirs.sendall(recording.read_bytes())
-    with ours, theirs, StreamSource("a", file=SocketBytes(ours)) as source:
+    with ours, theirs, StreamSource("a", file=SocketReader(ours)) as source:
         got = []
         for events in source.chunks():
             got.append(events)

@@ -1,4 +1,4 @@
-"""Sources that may wait for ever, as streams of silent senders, opened and read until a request to stop."""
+"""Open and read sources that may wait forever, as a silent stream does, until a request to stop."""
 
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -11,14 +11,14 @@ from evlcp_sdk.signals import Stopped, waiting
 from evlcp_sdk.values import Events, Triggers
 
 
-def open_until(source: EventSource | str | Path, registry: Registry, stopped: Stopped) -> EventSource:
-    """Open a source, or give one that is open; a request to stop ends the wait for a sender.
+def open_until_stopped(source: EventSource | str | Path, registry: Registry, stopped: Stopped) -> EventSource:
+    """Open a source, or return one that is open already; a request to stop ends the wait for a sender.
 
-    A file is there at once, and is opened whatever was asked: who reads it ends when he asks.
+    A file never waits, so it is opened even after a request to stop; its reader then ends.
 
     Raises:
         InputError: It cannot be opened.
-        KeyboardInterrupt: It was asked to stop, and the source is no file.
+        KeyboardInterrupt: A stop was requested, and the source is not a file.
     """
     if isinstance(source, EventSource):
         return source
@@ -33,8 +33,8 @@ def _is_file(source: str | Path) -> bool:
         return False
 
 
-def pieces_until(source: EventSource, stopped: Stopped) -> Iterator[tuple[Events, Triggers]]:
-    """What a source streams; of one without a size, which may wait for ever, until it is asked to stop.
+def stream_until_stopped(source: EventSource, stopped: Stopped) -> Iterator[tuple[Events, Triggers]]:
+    """Yield what a source streams; a request to stop ends the wait for one without a size.
 
     Raises:
         InputError: It cannot be read on.
