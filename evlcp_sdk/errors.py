@@ -14,9 +14,8 @@ EvlcpError                     1   anything the SDK raises on purpose
 └── StreamError                1   events fed in an order or shape the receiver cannot take
 ```
 
-A recording of which much was dropped is no error, but ends a command with `DEGRADED`, 4.
-
-`PluginWarning` is a warning: a plugin is broken and left out, and all others go on.
+A recording of which much was dropped is no error, but ends a command with `DEGRADED`, 4. `PluginWarning`
+warns of a broken plugin that is left out.
 """
 
 from importlib import import_module
@@ -41,7 +40,7 @@ class UnknownAlgorithmError(ConfigError):
 
 
 class PluginError(EvlcpError):
-    """An algorithm of a broken plugin, one whose code fails, or one of two that claim one (role, id)."""
+    """An algorithm of a broken plugin, one whose code fails, or one of two with the same role and id."""
 
     exit_code = 2
 
@@ -66,8 +65,8 @@ class RawFormatError(InputError):
     Args:
         path: The file.
         offset: Byte offset of the fault, counted from the start of the file.
-        found: What stands there.
-        expected: What should stand there.
+        found: What is there.
+        expected: What should be there.
     """
 
     def __init__(self, path: Path | str, offset: int, found: str, expected: str) -> None:
@@ -79,7 +78,7 @@ class RawFormatError(InputError):
 
 
 class UnpluggedError(InputError):
-    """A camera that went away while it was read; what was received until then is kept."""
+    """A camera that was unplugged while it was read; what was received until then is kept."""
 
     exit_code = 5
 
@@ -99,7 +98,7 @@ class InterruptedRunError(EvlcpError):
 
 
 def import_extra(module: str, extra: str) -> Any:
-    """A module of a package that comes with an extra.
+    """Import a module of a package that comes with an extra.
 
     Raises:
         ConfigError: It is not installed.
@@ -117,23 +116,21 @@ DEGRADED = 4
 """Exit code where a recording was decoded and much of it dropped."""
 
 OWN_FAULT = 70
-"""Exit code of a fault that is the SDK's own."""
+"""Exit code of a fault of the SDK itself."""
 
-_FAILED = 1
-_MOST_PLACES = 12
+_FAILURE = 1
+_MAX_PLACES = 12
 
 
-def explained(fault: BaseException) -> tuple[str, int]:
-    """What is said of anything that was raised, and the exit code: a line a fault of what was given, one line
-    that says what to report where it is our own.
-    """
+def explain_fault(fault: BaseException) -> tuple[str, int]:
+    """The message about an exception, and the exit code; a fault of the SDK itself gives a line to report."""
     if isinstance(fault, EvlcpError):
         return str(fault), fault.exit_code
     if isinstance(fault, MemoryError):
-        return f"not enough memory: {_first_line(fault)}", _FAILED
+        return f"not enough memory: {_first_line(fault)}", _FAILURE
     if isinstance(fault, OSError) and fault.filename is not None:
-        return f"{fault.filename}: {fault.strerror}", _FAILED
-    return _report(fault), OWN_FAULT
+        return f"{fault.filename}: {fault.strerror}", _FAILURE
+    return _report_line(fault), OWN_FAULT
 
 
 def _first_line(fault: BaseException) -> str:
@@ -141,7 +138,7 @@ def _first_line(fault: BaseException) -> str:
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 
-def _report(fault: BaseException) -> str:
+def _report_line(fault: BaseException) -> str:
     """What happened, where, and with which versions."""
     import platform
     import traceback
@@ -150,7 +147,7 @@ def _report(fault: BaseException) -> str:
     def place(frame: traceback.FrameSummary) -> str:
         return f"{'/'.join(Path(frame.filename).parts[-2:])}:{frame.lineno}"
 
-    frames = traceback.extract_tb(fault.__traceback__)[-_MOST_PLACES:]
+    frames = traceback.extract_tb(fault.__traceback__)[-_MAX_PLACES:]
     return (
         f"a fault of evlcp itself, not of what you gave: {type(fault).__name__}: {_first_line(fault)};"
         " please report the command, what it was given, and this line:"

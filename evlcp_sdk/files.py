@@ -1,9 +1,8 @@
-"""Files written whole, so that no reader ever sees half a result; small ones read whole.
+"""Files written so that no reader ever sees half a result; and small ones read whole.
 
-Whatever the SDK leaves behind goes through `Outputs`, whose rules are these: files grow in a private folder
-of random name beside their places and come into place together; links are neither followed nor replaced,
-nor are devices replaced; and a run that dies while its files come into place leaves a mark that readers
-refuse.
+The SDK writes all its results by `Outputs`: files grow in a private folder of random name beside their
+targets and are moved into place together; links are neither followed nor replaced, nor are devices replaced;
+and a run that dies while its files are moved leaves a mark that readers refuse.
 """
 
 import csv
@@ -28,22 +27,22 @@ from evlcp_sdk.errors import ConfigError, InputError, OutputError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_OTHERS = 0o077
-"""Permissions that a private file does not give."""
+_OTHERS_PERMISSIONS = 0o077
+"""Those of group and others, which a private file does not have."""
 
 STAGE_PREFIX = ".evlcp-"
-"""How the name of a folder begins in which files grow; what a killed run leaves of it may be deleted."""
+"""Of the folders in which files grow; those that a killed run leaves may be deleted."""
 
 _UNFINISHED = {
     "status": "unfinished",
     "error": "the run ended while its files came into place: those beside this one may belong to two runs",
 }
-"""What stands in place of the last file, if it is JSON, while others come into place."""
+"""Stands in for the last file, if it is JSON, while the others are moved into place."""
 
 
 @contextmanager
 def writing(path: Path | str) -> Iterator[None]:
-    """What the system refuses within becomes an `OutputError` that names the file or folder."""
+    """Turn an `OSError` within into an `OutputError` that names the file or folder."""
     try:
         yield
     except OSError as fault:
@@ -52,7 +51,7 @@ def writing(path: Path | str) -> Iterator[None]:
 
 @contextmanager
 def _reading(path: Path | str) -> Iterator[None]:
-    """What the system refuses within becomes an `InputError` that names the file."""
+    """Turn an `OSError` within into an `InputError` that names the file."""
     try:
         yield
     except OSError as fault:
@@ -60,12 +59,12 @@ def _reading(path: Path | str) -> Iterator[None]:
 
 
 class Outputs:
-    """Files that come into place together, or not at all; a context manager that is ended by `commit`.
+    """Files that come into place together, or not at all; a context manager that `commit` completes.
 
-    Until then, and after a crash, what was there before stays. The file that was asked for last is the seal:
-    while the others come into place it is away, or, if it is JSON, says that the files are unfinished,
-    which `read_json` refuses. So who finds it finds all of them. What is no regular file (a pipe,
-    `/dev/null`) is written directly.
+    Until then, and after a crash, earlier files stay. The file that was asked for last is the seal: while the
+    others are moved into place it is missing, or, if it is JSON, says that the files are unfinished, which
+    `read_json` refuses. So whoever finds it finds all of them. What is no regular file (a pipe, `/dev/null`)
+    is written directly.
     """
 
     def __init__(self) -> None:
@@ -76,10 +75,10 @@ class Outputs:
         self._open: list[IO[Any]] = []
 
     def path(self, target: Path) -> Path:
-        """Where a file is to be written, which becomes `target` in the end; nothing is there yet.
+        """Where to write a file that `commit` moves to `target`; nothing is there yet.
 
         Raises:
-            OutputError: There is no such folder, it cannot be written, or a link or a folder is in the place.
+            OutputError: The folder is missing or cannot be written, or a link or a folder is in the way.
         """
         if target in self._staged:
             return self._staged[target]
@@ -96,19 +95,19 @@ class Outputs:
         return self._staged[target]
 
     def open(self, target: Path) -> TextIO:
-        """A text file, UTF-8, line ends as written; it is closed with the others.
+        """Open a text file, UTF-8, line ends as written; it is closed with the others.
 
         Raises:
             OutputError: As `path`.
             OSError: It cannot be opened.
         """
-        return self._opened(target, "", encoding="utf-8", newline="")  # type: ignore[return-value]
+        return self._open_file(target, "", encoding="utf-8", newline="")  # type: ignore[return-value]
 
     def open_binary(self, target: Path) -> BinaryIO:
-        """A binary file; as `open`."""
-        return self._opened(target, "b")  # type: ignore[return-value]
+        """Open a binary file; as `open`."""
+        return self._open_file(target, "b")  # type: ignore[return-value]
 
-    def _opened(self, target: Path, kind: str, **text: str) -> IO[Any]:
+    def _open_file(self, target: Path, kind: str, **text: str) -> IO[Any]:
         path = self.path(target)
         self._open.append(path.open(f"{'w' if target in self._direct else 'x'}{kind}", **text))  # type: ignore[call-overload]
         return self._open[-1]
@@ -130,38 +129,37 @@ class Outputs:
         """
         import numpy as np
 
-        # To a file itself NumPy writes past Python, which a pipe cannot take.
-        whole = io.BytesIO()
-        np.save(whole, array)
+        # NumPy bypasses Python when it writes to a file, which fails on a pipe.
+        buffer = io.BytesIO()
+        np.save(buffer, array)
         with writing(target), self.open_binary(target) as file:
-            file.write(whole.getbuffer())
+            file.write(buffer.getbuffer())
 
     def drop(self, target: Path) -> None:
-        """Remove what is left of an earlier run when the files come into place."""
+        """Remove a file of an earlier run when these come into place."""
         self._dropped.append(target)
 
     def digests(self) -> dict[str, dict[str, Any]]:
-        """Size and SHA-256 of each file that is written so far, by its name; closes those that `open` gave.
+        """Close the open files; size and SHA-256 of each that was written, by its name.
 
         Raises:
             OSError: Something cannot be written or read back.
         """
         for file in self._open:
             file.close()
-        found = {}
+        digests = {}
         for target, staged in self._staged.items():
             if staged.exists():
                 with staged.open("rb") as file:
                     digest = hashlib.file_digest(file, "sha256").hexdigest()
-                found[target.name] = {"bytes": staged.stat().st_size, "sha256": digest}
-        return found
+                digests[target.name] = {"bytes": staged.stat().st_size, "sha256": digest}
+        return digests
 
     def commit(self) -> None:
-        """Bring all files into place, the seal last, and drop what is to be dropped.
+        """Move all files into place, the seal last, and remove those to drop.
 
         Raises:
-            OutputError: A file cannot be written; an earlier result stays, unless the fault came while files
-                came into place.
+            OutputError: A file cannot be written; an earlier result stays, unless files were already moved.
         """
         with writing(next(iter((*self._staged, *self._direct)), Path())):
             for file in self._open:
@@ -172,13 +170,13 @@ class Outputs:
                 # Somebody may have put a link there meanwhile.
                 _is_special(target)
                 _sync(staged)
-        gone = [*self._dropped, *(target for target in self._staged if target not in written)]
-        gone = [target for target in gone if os.path.lexists(target)]
+        obsolete = [*self._dropped, *(target for target in self._staged if target not in written)]
+        obsolete = [target for target in obsolete if os.path.lexists(target)]
         seal = next(reversed(written), None)
-        if seal is not None and (gone or len(written) > 1):
+        if seal is not None and (obsolete or len(written) > 1):
             with writing(seal):
                 self._unseal(seal)
-        for target in gone:
+        for target in obsolete:
             with writing(target):
                 target.unlink()
         for target, staged in written.items():
@@ -192,7 +190,7 @@ class Outputs:
         self.discard()
 
     def _unseal(self, seal: Path) -> None:
-        """Take the seal's place while the files are those of two runs."""
+        """Remove the seal, or mark it as unfinished, while the files are those of two runs."""
         if seal.suffix == ".json":
             mark = self._stages[seal.parent] / f"{seal.name}.unfinished"
             with mark.open("x", encoding="utf-8") as file:
@@ -210,7 +208,7 @@ class Outputs:
     def discard(self) -> None:
         """Remove what has not come into place."""
         for file in self._open:
-            # A file that could not be written cannot be flushed either, and is dropped.
+            # A file that could not be written cannot be flushed either.
             with suppress(OSError):
                 file.close()
         for stage in self._stages.values():
@@ -225,37 +223,37 @@ class Outputs:
 
 
 def _is_special(path: Path) -> bool:
-    """Whether something is no regular file but can be written: a pipe, a terminal, `/dev/null`.
+    """Whether a path can be written though it is no regular file: a pipe, a terminal, `/dev/null`.
 
     Raises:
         OutputError: It is a link to a file, a folder or a disk.
     """
     try:
-        mode = found = path.lstat().st_mode
+        mode = own_mode = path.lstat().st_mode
     except FileNotFoundError:
         return False
-    if stat.S_ISLNK(found):
+    if stat.S_ISLNK(own_mode):
         # Such as /dev/stdout, and what a shell gives for >(command).
         with suppress(OSError):
             mode = path.stat().st_mode
     if stat.S_ISCHR(mode) or stat.S_ISFIFO(mode):
         return True
-    if stat.S_ISLNK(found):
+    if stat.S_ISLNK(own_mode):
         raise OutputError(
             f"{path}: cannot be written: it is a link; name the file itself, or remove the link"
         )
-    if not stat.S_ISREG(found):
-        what = "Is a directory" if stat.S_ISDIR(found) else "neither a file nor a pipe"
+    if not stat.S_ISREG(own_mode):
+        what = "Is a directory" if stat.S_ISDIR(own_mode) else "neither a file nor a pipe"
         raise OutputError(f"{path}: cannot be written: {what}")
     return False
 
 
 def check_output(path: Path, *, regular: bool = True) -> None:
-    """See that something can be written here, before the work is done.
+    """Check before the work that a file can be written here.
 
     Args:
-        path: The file; it need not be there.
-        regular: A pipe or a terminal will not do.
+        path: The file; it need not exist.
+        regular: Refuse a pipe or a terminal.
 
     Raises:
         OutputError: A link, a folder or a device is in its place.
@@ -267,12 +265,12 @@ def check_output(path: Path, *, regular: bool = True) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Have the disk hold what was written of a file, or the names in a folder."""
+    """Flush a file, or the names in a folder, to the disk."""
     number = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(number)
     except OSError as fault:
-        # Some file systems hold their folders without being asked, and cannot be.
+        # Some file systems flush their folders by themselves, and cannot be asked to.
         if not (path.is_dir() and fault.errno in (errno.EINVAL, errno.ENOTSUP)):
             raise
     finally:
@@ -280,10 +278,10 @@ def _sync(path: Path) -> None:
 
 
 def write_secret(data: bytes, path: Path) -> None:
-    """Write a file that its owner alone can use; one that cannot be written whole does not stay.
+    """Write a file that its owner alone can use; half a file does not stay.
 
     Raises:
-        OutputError: Something is there, or it cannot be written.
+        OutputError: It exists, or cannot be written.
     """
     if os.path.lexists(path):
         raise OutputError(f"{path}: exists; a key is not overwritten; --show prints it again")
@@ -300,23 +298,23 @@ def write_secret(data: bytes, path: Path) -> None:
             raise
 
 
-def read_secret(path: Path, most_bytes: int) -> bytes:
-    """The first bytes of a file that its owner alone can use.
+def read_secret(path: Path, max_bytes: int) -> bytes:
+    """Read the first bytes of a file that its owner alone can use.
 
     Raises:
         InputError: It cannot be read, or others can use it.
     """
     with _reading(path), path.open("rb") as file:
         mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
-        if mode & _OTHERS:
+        if mode & _OTHERS_PERMISSIONS:
             raise InputError(
                 f"{path}: mode {mode:04o}, expected a private key that its owner alone can use: chmod 600"
             )
-        return file.read(most_bytes)
+        return file.read(max_bytes)
 
 
 def open_log(path: Path) -> TextIO:
-    """A text file that is there while it grows, for what must outlast a crash; links are not followed.
+    """Open a text file that is in place while it grows, to survive a crash; links are not followed.
 
     Raises:
         OutputError: The file cannot be written.
@@ -327,10 +325,10 @@ def open_log(path: Path) -> TextIO:
         return os.fdopen(os.open(path, flags, 0o666), "w", encoding="utf-8")
 
 
-def defused(text: str) -> str:
-    """Text for a cell of a CSV file: what a spreadsheet would take for a formula begins with `'`.
+def escape_formula(text: str) -> str:
+    """Prefix a CSV cell that a spreadsheet would take for a formula with `'`.
 
-    >>> defused("=1+1"), defused("night.raw")
+    >>> escape_formula("=1+1"), escape_formula("night.raw")
     ("'=1+1", 'night.raw')
     """
     return f"'{text}" if text[:1] in _FORMULA else text
@@ -340,27 +338,22 @@ _FORMULA = frozenset("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")
 
 
 def check_sha256(path: Path, expected: str, source: str) -> None:
-    """See that a file is the one that another file names.
-
-    Args:
-        path: The file.
-        expected: SHA-256, 64 hex digits.
-        source: Who says so, for the message.
+    """Check that a file is the one whose SHA-256, 64 hex digits, another file (`source`) gives.
 
     Raises:
         InputError: It cannot be read, or is another one.
     """
     with _reading(path), path.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != expected:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if digest != expected:
         raise InputError(
-            f"{path}: not the file that {source} speaks of: SHA-256 {found[:16]}, expected {expected[:16]};"
+            f"{path}: not the file that {source} speaks of: SHA-256 {digest[:16]}, expected {expected[:16]};"
             " changed since, or of another run"
         )
 
 
 def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[str, Any]]]]:
-    """The columns of a CSV file, and its rows of text by column, each with its line; empty lines give no row.
+    """Read the columns of a CSV file and its rows of text, each with its line; empty lines give no row.
 
     Raises:
         InputError: The file cannot be read, or is not CSV.
@@ -378,9 +371,9 @@ def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[st
         if names.count(name) > 1:
             raise ConfigError(f"{path}: line 1: {names.count(name)} columns {name}: expected one")
     for line, row in rows:
-        beyond = len(row.get(None, ()))
-        if beyond or None in row.values():
-            fields = len(names) + beyond - list(row.values()).count(None)
+        surplus = len(row.get(None, ()))
+        if surplus or None in row.values():
+            fields = len(names) + surplus - list(row.values()).count(None)
             raise ConfigError(f"{path}: line {line}: {fields} fields, expected {len(names)}, as line 1 has")
     return names, rows
 
@@ -388,64 +381,64 @@ def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[st
 _UNITS = frozenset(
     ("deg", "rad", "mrad", "m", "mm", "cm", "km", "s", "ms", "us", "ns", "g", "m2", "s2", "m2s")
 )
-"""Words of a column's name that are its unit."""
+"""Words of a column's name that give its unit."""
 
-_LIKE = 0.85
-"""Share of letters in common by which one name is a slip of another: a letter of four to eight."""
+_MIN_SIMILARITY = 0.85
+"""Of two names, from which on one is a typing error of the other: a letter of four to eight."""
 
 
 def check_columns(
     path: Path | str, names: Sequence[str], needed: Sequence[str], optional: Sequence[str] = ()
 ) -> None:
-    """Check the columns of a CSV file that was read; further ones of other names are anyone's.
+    """Check the columns of a CSV file; further ones are allowed if they resemble none that is missing.
 
-    An optional column that is not there, beside one that looks like it (other unit, case, order of words, a
-    slip, another axis of what comes by axes), would be lost in silence.
+    An optional column under a similar name (other unit, case, order of words, a typing error, another axis)
+    would be lost silently.
 
     Raises:
         ConfigError: A needed one is missing, or one looks like another that is missing.
     """
     known = (*needed, *optional)
-    lacking = {name: _words(name) for name in known if name not in names}
-    starts = [_words(name)[:1] for name in known]
+    missing_words = {name: _split_words(name) for name in known if name not in names}
+    first_words = [_split_words(name)[:1] for name in known]
     for name in names:
         if name in known or not name:
             continue
-        words = _words(name)
-        for meant, its in lacking.items():
-            axes = words[:1] == its[:1] and starts.count(words[:1]) >= 3
-            slip = difflib.SequenceMatcher(None, "_".join(words), "_".join(its)).ratio() >= _LIKE
-            if axes or slip or sorted(words) == sorted(its):
-                raise ConfigError(f"{path}: line 1: column {name!r:.40}: expected {meant}")
+        words = _split_words(name)
+        for expected, its in missing_words.items():
+            axes = words[:1] == its[:1] and first_words.count(words[:1]) >= 3
+            similarity = difflib.SequenceMatcher(None, "_".join(words), "_".join(its)).ratio()
+            if axes or similarity >= _MIN_SIMILARITY or sorted(words) == sorted(its):
+                raise ConfigError(f"{path}: line 1: column {name!r:.40}: expected {expected}")
     missing = [name for name in needed if name not in names]
     if missing:
         raise ConfigError(f"{path}: line 1: no column {missing[0]} (columns: {', '.join(known)})")
 
 
-def _words(name: str) -> list[str]:
+def _split_words(name: str) -> list[str]:
     return [word for word in re.split("[^a-z0-9]+", name.lower()) if word and word not in _UNITS]
 
 
-_MOST = 1e18
-"""Size of the largest number of a CSV file: microseconds since 1970 are 1e15."""
+_MAX_NUMBER = 1e18
+"""Largest number in a CSV file: microseconds since 1970 are 1e15."""
 
 ANY_NUMBER = (-math.inf, math.inf)
 
 
-def csv_number(
+def parse_csv_number(
     path: Path | str, line: int, name: str, text: str | None, within: tuple[float, float] = ANY_NUMBER
 ) -> float:
-    """A number of a CSV file that was read.
+    """Parse a number of a CSV file.
 
     Raises:
-        ConfigError: It is not one, larger than any that makes sense, or not between these two.
+        ConfigError: It is no number, too large to make sense, or outside the range `within`.
     """
     try:
         value = float(text if text is not None else "")
     except ValueError:
         value = math.nan
-    if not abs(value) <= _MOST:
-        wanted = "a number" if not math.isfinite(value) else f"at most {_MOST:g}"
+    if not abs(value) <= _MAX_NUMBER:
+        wanted = "a number" if not math.isfinite(value) else f"at most {_MAX_NUMBER:g}"
         raise ConfigError(f"{path}: line {line}: {name} = {text!r:.40}: expected {wanted}")
     low, high = within
     if not low <= value <= high:
@@ -459,12 +452,12 @@ def read_table(
     optional: Mapping[str, tuple[float, float]],
     rising: str = "",
 ) -> tuple[list[int], dict[str, "NDArray[Any]"]]:
-    """The line of each row of a CSV file, and its columns of numbers, float64 (n,) each, n >= 1.
+    """Read the line of each row of a CSV file, and its columns of numbers, float64 (n,) each, n >= 1.
 
     Args:
         path: The file.
-        needed: Columns that it must have, and between what their numbers are.
-        optional: Those that it may have.
+        needed: Required columns, and the range of their numbers.
+        optional: The same of optional columns.
         rising: The column whose numbers must rise from line to line, as times do.
 
     Raises:
@@ -478,7 +471,7 @@ def read_table(
     if not rows:
         raise ConfigError(f"{path}: expected one line of values or more")
     table = {
-        name: np.array([csv_number(path, line, name, row[name], within) for line, row in rows])
+        name: np.array([parse_csv_number(path, line, name, row[name], within) for line, row in rows])
         for name, within in {**needed, **optional}.items()
         if name in names
     }
@@ -502,40 +495,40 @@ def check_rising(path: Path | str, lines: Sequence[int], name: str, values: "NDA
             )
 
 
-def is_there(path: Path | str) -> bool:
-    """Whether there is a file or a folder of that name; what cannot be a name is not there."""
+def path_exists(path: Path | str) -> bool:
+    """Whether a file or folder of that name exists; false for what cannot be a name."""
     try:
         return Path(path).exists()
     except OSError:
         return False
 
 
-MOST_BYTES = 1 << 28
-"""Files of more bytes are not read whole."""
+MAX_BYTES = 1 << 28
+"""Larger files are not read whole."""
 
 
-def read_whole(path: Path | str) -> bytes:
-    """The bytes of a file.
+def read_bytes(path: Path | str) -> bytes:
+    """Read a whole file.
 
     Raises:
-        InputError: It cannot be read, or is too large to be read whole, as a device without end.
+        InputError: It cannot be read, or is too large, as an endless device.
     """
     with _reading(path), Path(path).open("rb") as file:
-        data = file.read(MOST_BYTES + 1)
-        if len(data) > MOST_BYTES:
-            raise OSError(errno.EFBIG, f"larger than {MOST_BYTES >> 20} MiB")
+        data = file.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise OSError(errno.EFBIG, f"larger than {MAX_BYTES >> 20} MiB")
     return data
 
 
-def read_numbers(path: Path | str) -> "NDArray[Any]":
-    """The array of numbers that a `.npy` file holds.
+def read_npy(path: Path | str) -> "NDArray[Any]":
+    """Read the array of numbers in a `.npy` file.
 
     Raises:
         InputError: The file cannot be read, or holds something else.
     """
     import numpy as np
 
-    data = read_whole(path)
+    data = read_bytes(path)
     if not data.startswith(b"\x93NUMPY"):
         raise InputError(f"{path}: not a .npy file of plain numbers")
     try:
@@ -550,14 +543,14 @@ def read_numbers(path: Path | str) -> "NDArray[Any]":
 
 
 def read_json(path: Path | str) -> Any:
-    """What a JSON file holds.
+    """Read a JSON file.
 
     Raises:
-        InputError: The file is what `Outputs` leaves of a run that died while its files came into place,
-            cannot be read, or is not JSON.
+        InputError: The file cannot be read, is not JSON, or is the mark that `Outputs` leaves of a run that
+            died while its files were moved into place.
     """
     try:
-        value = json.loads(read_whole(path))
+        value = json.loads(read_bytes(path))
     except (ValueError, RecursionError) as fault:
         raise InputError(f"{path}: not JSON: {fault}") from fault
     if value == _UNFINISHED:
@@ -565,8 +558,8 @@ def read_json(path: Path | str) -> Any:
     return value
 
 
-def shipped(folder: str, name: str) -> Path:
-    """A file that comes with the SDK: in the wheel, or in a checkout's `examples/`.
+def find_shipped_file(folder: str, name: str) -> Path:
+    """The path of a file that comes with the SDK: in the wheel, or in a checkout's `examples/`.
 
     Raises:
         FileNotFoundError: It is not there.

@@ -13,42 +13,42 @@ from typing import Any, TypeVar, overload
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_ROOM_BYTES = 50_000_000
-"""All kernels take less; Numba fails in the middle of a run where a kernel cannot be written."""
+_MIN_FREE_BYTES = 50_000_000
+"""More than all kernels take; Numba fails in the middle of a run when a kernel cannot be written."""
 
-_LONG_S = 2.0
-"""Time spent on compiling after which that is said."""
+_REPORT_AFTER_S = 2.0
+"""Time spent on compiling after which it is logged."""
 
-_AGAIN_S = 10.0
-"""And how far it is, each time that this has passed."""
+_REPORT_EVERY_S = 10.0
+"""And how often the progress is, from then on."""
 
 
-class Compiling:
-    """What compiling kernels, and loading those that are kept, has taken in this process.
+class CompileTimer:
+    """Time spent in this process on compiling kernels, and on loading cached ones.
 
-    That it is compiled, and how far it is, is said to the log when it takes long; loading is not.
+    Compiling that takes long is logged, with its progress; loading is not.
 
     Attributes:
         processor_s: Processor time, s.
-        elapsed_s: Time on the clock, s.
+        elapsed_s: Wall-clock time, s.
     """
 
     def __init__(self) -> None:
         self.processor_s = self.elapsed_s = 0.0
         self._compiled_s = 0.0
         self._depth = 0
-        self._said_at_s = _LONG_S
+        self._report_at_s = _REPORT_AFTER_S
 
-    def watched(self, kernel: Any) -> Callable[[Any], Any]:
-        """A kernel's `compile`, its time added; a kernel may need others.
+    def watch(self, kernel: Any) -> Callable[[Any], Any]:
+        """A kernel's `compile` that adds the time it takes, also when it compiles other kernels.
 
-        What is kept of a version whose types there are no longer is forgotten.
+        A cached version whose types no longer exist is deleted.
         """
         compile_: Callable[[Any], Any] = kernel.compile
 
         @wraps(compile_)
-        def watched(sig: Any) -> Any:
-            begin = time.process_time(), time.perf_counter()
+        def timed_compile(sig: Any) -> Any:
+            start = time.process_time(), time.perf_counter()
             compiled = sum(kernel.stats.cache_misses.values())
             self._depth += 1
             try:
@@ -62,64 +62,64 @@ class Compiling:
             finally:
                 self._depth -= 1
                 if not self._depth:
-                    self.processor_s += time.process_time() - begin[0]
-                    elapsed_s = time.perf_counter() - begin[1]
+                    self.processor_s += time.process_time() - start[0]
+                    elapsed_s = time.perf_counter() - start[1]
                     self.elapsed_s += elapsed_s
                     if sum(kernel.stats.cache_misses.values()) > compiled:
                         self._compiled_s += elapsed_s
-                    if self._compiled_s > self._said_at_s:
-                        self._said_at_s = self._compiled_s + _AGAIN_S
+                    if self._compiled_s > self._report_at_s:
+                        self._report_at_s = self._compiled_s + _REPORT_EVERY_S
                         logging.getLogger(__name__).info(
                             f"compiling kernels, once on a machine: {count_compiled()} of {count_imported()}"
                         )
 
-        return watched
+        return timed_compile
 
 
-COMPILING = Compiling()
+COMPILE_TIMER = CompileTimer()
 """Of this process."""
 
 
 class _Kernel:
-    """Stands in a module for a kernel, until one of them is called: only then Numba is imported.
+    """Stands in a module for a kernel until one of the module is called: only then Numba is imported.
 
-    All of that module are made then, as one may call another.
+    All kernels of that module are loaded then, as one may call another.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
-        self._function, self._options, self._made = function, options, None
+        self._function, self._options, self._dispatcher = function, options, None
 
     def __call__(self, *args: Any) -> Any:
-        return self.made()(*args)
+        return self.load()(*args)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.made(), name)
+        return getattr(self.load(), name)
 
-    def made(self) -> Any:
-        with _MAKING:
-            if self._made is None:
-                self._made = _compiled(self._function, self._options)
+    def load(self) -> Any:
+        with _LOAD_LOCK:
+            if self._dispatcher is None:
+                self._dispatcher = _create_dispatcher(self._function, self._options)
                 names = self._function.__globals__
                 for name in list(names):
-                    # Making one makes others.
+                    # Loading one loads others.
                     if isinstance(names[name], _Kernel):
-                        names[name] = names[name].made()
-        return self._made
+                        names[name] = names[name].load()
+        return self._dispatcher
 
 
-_MAKING = RLock()
+_LOAD_LOCK = RLock()
 
 
-def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+def _create_dispatcher(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     import numba
 
     kernel = numba.njit(**options)(function)
-    # Numba finds no folder: RuntimeError.
+    # RuntimeError: Numba finds no folder.
     with suppress(RuntimeError):
         kernel.enable_caching()
-        if shutil.disk_usage(kernel.stats.cache_path).free < _ROOM_BYTES:
+        if shutil.disk_usage(kernel.stats.cache_path).free < _MIN_FREE_BYTES:
             kernel = numba.njit(**options)(function)
-    kernel.compile = COMPILING.watched(kernel)
+    kernel.compile = COMPILE_TIMER.watch(kernel)
     return kernel
 
 
@@ -132,36 +132,36 @@ def njit(**options: Any) -> Callable[[F], F]: ...
 
 
 def njit(function: Any = None, /, **options: Any) -> Any:
-    """As `numba.njit`, without the GIL, and cached; where no folder can be written, compiled in each process.
+    """As `numba.njit`, without the GIL, and cached; compiled in each process where no folder can be written.
 
-    To divide by 0 gives what NumPy gives, which is quicker to compile than an error. None is called by C.
+    A division by 0 gives what NumPy gives, which is quicker to compile than an error. C calls none of them.
 
     Args:
-        function: What is compiled at its first call.
-        options: Others of `numba.njit`.
+        function: Compiled at its first call.
+        options: Further options of `numba.njit`.
     """
-    chosen: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True} | options
-    return (lambda given: _Kernel(given, chosen)) if function is None else _Kernel(function, chosen)
+    all_options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True} | options
+    return (lambda f: _Kernel(f, all_options)) if function is None else _Kernel(function, all_options)
 
 
-def _all_kernels() -> Iterator[Any]:
-    """All of modules of which one has been called."""
+def _loaded_kernels() -> Iterator[Any]:
+    """The kernels of modules of which one has been called."""
     for name, module in list(sys.modules.items()):
         if name.endswith("_kernels"):
-            made = (one for one in list(vars(module).values()) if not isinstance(one, _Kernel))
-            yield from (one for one in made if hasattr(one, "py_func"))
+            values = (value for value in list(vars(module).values()) if not isinstance(value, _Kernel))
+            yield from (value for value in values if hasattr(value, "py_func"))
 
 
 def count_imported() -> int:
-    """How many kernels this process has made; most of them will be called."""
-    return sum(1 for _ in _all_kernels())
+    """How many kernels this process has loaded; most of them will be called."""
+    return sum(1 for _ in _loaded_kernels())
 
 
 def count_compiled() -> int:
     """How many kernels this process has compiled."""
-    return sum(sum(kernel.stats.cache_misses.values()) for kernel in _all_kernels())
+    return sum(sum(kernel.stats.cache_misses.values()) for kernel in _loaded_kernels())
 
 
 def find_cache_folder() -> Path | None:
-    """The folder of the kernels made first; None where none can be written."""
-    return next((Path(k.stats.cache_path) for k in _all_kernels() if k.stats.cache_path is not None), None)
+    """The folder of the kernels loaded first; None where none can be written."""
+    return next((Path(k.stats.cache_path) for k in _loaded_kernels() if k.stats.cache_path is not None), None)

@@ -1,13 +1,13 @@
-"""Modules that are imported when something of them is used: formats, and SciPy."""
+"""Modules that are imported at their first use: formats, and SciPy."""
 
 from importlib import import_module
 from typing import Any
 
 
 class LazyModule:
-    """Stands for a module; after the first use a name of it costs what a name of any module does.
+    """Stands for a module that is imported at its first use; later uses cost what any module's do.
 
-    An import in a function that runs a thousand times a second takes longer than some kernels.
+    An import statement in a function that runs a thousand times a second takes longer than some kernels.
 
     Args:
         name: Of the module.

@@ -34,7 +34,7 @@ from evlcp_sdk.results.columns import frames_table
 from evlcp_sdk.results.summary import RunEnd, Status
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.signals import Stopped, never
+from evlcp_sdk.signals import Stopped, never_stop
 from evlcp_sdk.stopwatch import Stopwatch, times_real_time
 from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Frame, Packet, span_us
@@ -96,7 +96,7 @@ def receive(
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
     with ExitStack() as stack:
-        opened = stack.enter_context(open_until_stopped(source, registry, never))
+        opened = stack.enter_context(open_until_stopped(source, registry, never_stop))
         pulses = _check_source(opened, _name_of(source, opened), links, clock_zero)
         receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero, workers=workers)
         stack.pop_all()
@@ -119,7 +119,7 @@ def _check_source(
     check_sensor(source, url, links[0].camera)
     if not isinstance(clock_zero, PulseClock):
         return None
-    if not (clock_zero.dated or source.live):
+    if not (clock_zero.is_dated or source.live):
         raise ConfigError(
             f"{url}: a pulse says when a second of UTC begins, not which one: give --clock-zero, UTC of the"
             " camera clock's 0 to less than half a second"
@@ -127,7 +127,9 @@ def _check_source(
     return clock_zero
 
 
-def _events_of(source: EventSource, pulses: PulseClock | None, stopped: Stopped = never) -> Iterator[Events]:
+def _events_of(
+    source: EventSource, pulses: PulseClock | None, stopped: Stopped = never_stop
+) -> Iterator[Events]:
     """The events of a source; its triggers go to the pulses before the events that came with them."""
     for events, triggers in stream_until_stopped(source, stopped):
         if pulses is not None:
@@ -240,7 +242,7 @@ def receive_to_folder(
     sinks: Sequence[str] = (),
     lines: Callable[[str], None] | None = None,
     advance: Advance = _say_nothing,
-    stopped: Stopped = never,
+    stopped: Stopped = never_stop,
 ) -> dict[str, Any]:
     """Receive a recording into a folder: source, receiver, positions, sinks; in constant memory.
 
@@ -298,7 +300,7 @@ def live(
     publisher: Publisher | None = None,
     budget: Budget | None = None,
     warm: bool = True,
-    stopped: Stopped = never,
+    stopped: Stopped = never_stop,
 ) -> dict[str, Any]:
     """Receive in real time: results to listeners as they come, delays measured, what is too much left out.
 
@@ -374,7 +376,7 @@ def convert(
     size: tuple[int, int] | None = None,
     format: str | None = None,
     advance: Advance = _say_nothing,
-    stopped: Stopped = never,
+    stopped: Stopped = never_stop,
 ) -> dict[str, Any]:
     """Write events and triggers of a source into a recording, in constant memory.
 

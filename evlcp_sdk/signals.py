@@ -1,4 +1,4 @@
-"""The signals that ask a program to end: Ctrl-C, that of a service manager, and a terminal that closes."""
+"""The signals that ask a program to end: Ctrl-C, a service manager's, and a closing terminal's."""
 
 import signal
 import threading
@@ -7,79 +7,79 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import FrameType
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""All are answered in the same way."""
+"""All are handled alike."""
 
 Handler = Callable[[int, FrameType | None], None]
 
 Stopped = Callable[[], bool]
-"""Asked after each piece of work whether to end early."""
+"""Called after each piece of work; true to end early."""
 
 
-def never() -> bool:
-    """Of a run that nobody ends early."""
+def never_stop() -> bool:
+    """The `Stopped` of a run that nobody ends early."""
     return False
 
 
 @contextmanager
-def heard_by(handler: Handler, *numbers: signal.Signals) -> Iterator[Callable[[], None]]:
-    """Have a handler hear some of them; gives a function that lets those hear them again that did before.
+def handle_signals(handler: Handler, *numbers: signal.Signals) -> Iterator[Callable[[], None]]:
+    """Install a handler for these signals; gives a function that restores the previous ones.
 
-    What somebody has set to be ignored, as `nohup` does, stays ignored, but for Ctrl-C. In a thread that
-    cannot listen nothing is done.
+    A signal that is ignored, as under `nohup`, stays ignored, but for Ctrl-C. Outside the main thread, which
+    alone receives signals, nothing is done.
     """
-    before: dict[int, Callable[[int, FrameType | None], object] | int | None] = {}
+    previous: dict[int, Callable[[int, FrameType | None], object] | int | None] = {}
 
     def restore() -> None:
-        while before:
-            signal.signal(*before.popitem())
+        while previous:
+            signal.signal(*previous.popitem())
 
     try:
         if threading.current_thread() is threading.main_thread():
             for number in numbers:
                 if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
-                    before[number] = signal.signal(number, handler)
+                    previous[number] = signal.signal(number, handler)
         yield restore
     finally:
         restore()
 
 
 class EndRequest:
-    """Whether a run was asked to end; made by `stop_on_request`, and called as a `Stopped`."""
+    """Whether a run was asked to end: a `Stopped` that `stop_on_request` makes."""
 
-    def __init__(self, root: "EndRequest | None" = None, also: Stopped = never) -> None:
+    def __init__(self, root: "EndRequest | None" = None, or_when: Stopped = never_stop) -> None:
         self._root = self if root is None else root
-        self._also = also
-        self._asked = self._waits = False
+        self._or_when = or_when
+        self._requested = self._waits = False
 
     def __call__(self) -> bool:
-        """Whether it was asked."""
-        return self._root._asked or self._also()
+        """Whether the run shall end."""
+        return self._root._requested or self._or_when()
 
-    def or_when(self, also: Stopped) -> "EndRequest":
-        """The same request, and another reason to end."""
-        return EndRequest(self._root, lambda: self._also() or also())
+    def or_when(self, condition: Stopped) -> "EndRequest":
+        """The same request with another reason to end."""
+        return EndRequest(self._root, lambda: self._or_when() or condition())
 
-    def ask(self) -> None:
-        """Ask it to end, now where it waits.
+    def request(self) -> None:
+        """Ask the run to end: at once where it waits.
 
         Raises:
             KeyboardInterrupt: Within `waiting`.
         """
-        self._root._asked = True
+        self._root._requested = True
         if self._root._waits:
             raise KeyboardInterrupt
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """Wait for something outside, which may never come: a request ends that at once.
+        """Wait for something external that may never come: a request ends it at once.
 
         Raises:
             KeyboardInterrupt: The run was asked to end, before or within.
         """
-        # In this order: a signal between the two ends it, too.
+        # In this order, a signal between the two ends it, too.
         self._root._waits = True
         try:
-            if self._root._asked:
+            if self._root._requested:
                 raise KeyboardInterrupt
             yield
         finally:
@@ -88,31 +88,31 @@ class EndRequest:
 
 @contextmanager
 def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[EndRequest]:
-    """Let Ctrl-C, SIGTERM or SIGHUP end a run after the piece in hand; a second one ends it at once.
+    """Let Ctrl-C, SIGTERM or SIGHUP end a run after the current piece; a second one ends it at once.
 
-    Gives what `receive_to_folder` takes as `stopped`. Only a main thread can listen.
+    Gives the `stopped` of `receive_to_folder`. Only the main thread receives signals.
 
     Args:
-        pass_on: Called at the first one, to tell others.
+        pass_on: Called at the first one, to notify others.
     """
-    request = EndRequest()
+    end = EndRequest()
 
-    def ask(_number: int, _frame: FrameType | None) -> None:
+    def request_end(_number: int, _frame: FrameType | None) -> None:
         restore()
         pass_on()
-        request.ask()
+        end.request()
 
-    with heard_by(ask, *ENDING) as restore:
-        yield request
+    with handle_signals(request_end, *ENDING) as restore:
+        yield end
 
 
 def waiting(stopped: Stopped) -> AbstractContextManager[None]:
-    """`EndRequest.waiting` of what may be one; nothing of any other `Stopped`."""
+    """`EndRequest.waiting` where `stopped` is one; else nothing."""
     return stopped.waiting() if isinstance(stopped, EndRequest) else nullcontext()
 
 
 def interrupt(_number: int, _frame: FrameType | None) -> None:
-    """What Python does at Ctrl-C.
+    """Do what Python does at Ctrl-C.
 
     Raises:
         KeyboardInterrupt: Always.

@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from evlcp_sdk.kernels import COMPILING
+from evlcp_sdk.kernels import COMPILE_TIMER
 
 
 def times_real_time(recorded_s: float, processor_s: float) -> float:
@@ -39,11 +39,11 @@ class Stopwatch:
     @contextmanager
     def running(self) -> Iterator[None]:
         """Count while inside."""
-        processor_s = time.process_time() - COMPILING.processor_s
-        elapsed_s, kernels_s = time.perf_counter() - COMPILING.elapsed_s, COMPILING.elapsed_s
+        processor_s = time.process_time() - COMPILE_TIMER.processor_s
+        elapsed_s, kernels_s = time.perf_counter() - COMPILE_TIMER.elapsed_s, COMPILE_TIMER.elapsed_s
         try:
             yield
         finally:
-            self.processor_s += time.process_time() - COMPILING.processor_s - processor_s
-            self.elapsed_s += time.perf_counter() - COMPILING.elapsed_s - elapsed_s
-            self.kernels_s += COMPILING.elapsed_s - kernels_s
+            self.processor_s += time.process_time() - COMPILE_TIMER.processor_s - processor_s
+            self.elapsed_s += time.perf_counter() - COMPILE_TIMER.elapsed_s - elapsed_s
+            self.kernels_s += COMPILE_TIMER.elapsed_s - kernels_s

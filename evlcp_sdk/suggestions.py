@@ -1,22 +1,22 @@
-"""How messages speak of what is not known, and of how many."""
+"""Parts of messages: counts, the nearest known word, the command that finds a fault."""
 
 import difflib
 from collections.abc import Sequence
 
 
-def counted(number: int, what: str) -> str:
-    """A number of things, with thousands apart.
+def format_count(number: int, what: str) -> str:
+    """A number of things, with separated thousands.
 
-    >>> counted(1, "frame"), counted(4000, "frame")
+    >>> format_count(1, "frame"), format_count(4000, "frame")
     ('1 frame', '4,000 frames')
     """
     return f"{number:,} {what}{'s' * (number != 1)}"
 
 
-def nearest(word: str, known: Sequence[str], kind: str = "known") -> str:
-    """The end of a message about an unknown word: the nearest that is known, and all that are.
+def suggest(word: str, known: Sequence[str], kind: str = "known") -> str:
+    """The end of a message about an unknown word: the nearest known one, and all of them.
 
-    >>> nearest("hight", ["height", "width"])
+    >>> suggest("hight", ["height", "width"])
     "; did you mean 'height'? (known: height, width)"
     """
     near = difflib.get_close_matches(word, known, n=1)
@@ -24,10 +24,10 @@ def nearest(word: str, known: Sequence[str], kind: str = "known") -> str:
     return f"{hint} ({kind}: {', '.join(known) or 'none'})"
 
 
-def hinted(what: str, role: str, id: str) -> str:
-    """A fault of an algorithm, and the command that finds it.
+def add_check_hint(fault: str, role: str, id: str) -> str:
+    """Append to an algorithm's fault the command that finds it.
 
-    >>> hinted("pilots algorithm 'mine': gave 3 codes", "pilots", "mine")
+    >>> add_check_hint("pilots algorithm 'mine': gave 3 codes", "pilots", "mine")
     "pilots algorithm 'mine': gave 3 codes; try: evlcp check pilots mine"
     """
-    return f"{what}; try: evlcp check {role} {id}"
+    return f"{fault}; try: evlcp check {role} {id}"

@@ -1,4 +1,4 @@
-"""Kernels compiled before they are needed, by doing once what needs them."""
+"""Kernels compiled ahead of their use, by a short run that needs them."""
 
 import tempfile
 import time
@@ -11,21 +11,21 @@ from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.simulated import simulate
 
 STEPS = ("simulate", "receive")
-"""What is done, in this order."""
+"""The steps of a warm-up, in this order."""
 
 _SCENE = ("duration_s=0.2", "motion.vib_rate_rad_s=0.3", "bars.payload=messages", "bars.text=warm")
-"""A drive so short, and so shaken that each way of decoding is needed."""
+"""A short drive with so much vibration that every way of decoding is needed."""
 
 
 @dataclass(frozen=True)
-class Warmth:
-    """What a warm-up took.
+class WarmUpResult:
+    """What a warm-up compiled.
 
     Attributes:
-        compiled: Kernels that were not there and are now.
-        elapsed_s: Time on the clock, s.
-        kept_in: A folder that they are kept in; None where none can be written, so that the next process
-            compiles them again.
+        compiled: Number of kernels that were compiled.
+        elapsed_s: Wall-clock time, s.
+        kept_in: The folder of their cache; None where none can be written, so that the next process compiles
+            them again.
     """
 
     compiled: int
@@ -33,19 +33,19 @@ class Warmth:
     kept_in: Path | None
 
 
-def warm_up(advance: Callable[[str], None] = lambda _step: None) -> Warmth:
-    """Simulate and receive a fifth of a second with the default link.
-
-    What that compiles is kept for later processes.
+def warm_up(advance: Callable[[str], None] = lambda _step: None) -> WarmUpResult:
+    """Simulate and receive a fifth of a second with the default link; later processes find its kernels.
 
     Args:
         advance: Called with the name of a step of `STEPS` when it begins.
     """
-    compiled, began_s = count_compiled(), time.perf_counter()
+    compiled_before, start_s = count_compiled(), time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="evlcp-warm-up-") as name:
         recording = Path(name) / "drive.raw"
         advance("simulate")
         simulate("drive-30kmh", overrides=_SCENE).save(recording)
         advance("receive")
         receive_to_folder(recording, Path(name) / "out")
-    return Warmth(count_compiled() - compiled, time.perf_counter() - began_s, find_cache_folder())
+    return WarmUpResult(
+        count_compiled() - compiled_before, time.perf_counter() - start_s, find_cache_folder()
+    )

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.files import read_whole
+from evlcp_sdk.files import read_bytes
 
 FLASH_START = 0x0800_0000
 """Where an STM32's flash begins."""
@@ -48,7 +48,7 @@ class FlashImage:
         Raises:
             InputError: It cannot be read, is damaged, or does not fit the flash.
         """
-        data = read_whole(path)
+        data = read_bytes(path)
         if data[:4] == b"\x7fELF":
             pieces = list(_elf_pieces(path, data))
         elif path.suffix.lower() in (".hex", ".ihex", ".ihx"):

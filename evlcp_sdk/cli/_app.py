@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 from typer.models import CommandInfo
 
 from evlcp_sdk.cli._common import echo, hush, log_on_stderr
-from evlcp_sdk.printable import printable
+from evlcp_sdk.printable import escape_controls
 
 if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
@@ -94,7 +94,7 @@ def _printable_faults() -> Iterator[None]:
     except Exception as fault:
         words = getattr(fault, "format_message", None)
         if words is not None:
-            said = printable(words())
+            said = escape_controls(words())
             fault.format_message = lambda: said  # type: ignore[attr-defined]
         raise
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._complain import complain
-from evlcp_sdk.printable import printable
+from evlcp_sdk.printable import escape_controls
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -50,7 +50,7 @@ Dask = Annotated[
 
 def echo(text: str, *, nl: bool = True) -> None:
     """Print a text on stdout; what it has of names and texts from outside moves no cursor."""
-    typer.echo(printable(text), nl=nl)
+    typer.echo(escape_controls(text), nl=nl)
 
 
 def print_json(value: object, indent: int | None = None) -> None:
@@ -98,7 +98,7 @@ def console(*, stderr: bool = False) -> "Console":
 
     def render(renderable: "RenderableType", options: "ConsoleOptions | None" = None) -> "Iterator[Segment]":
         for text, style, control in rendered(renderable, options):
-            yield Segment(text if control else printable(text), style, control)
+            yield Segment(text if control else escape_controls(text), style, control)
 
     made.render = render  # type: ignore[method-assign]
     return made

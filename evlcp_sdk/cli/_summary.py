@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from evlcp_sdk.cli._common import console, print_json
 from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.cli._tables import print_table
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -113,7 +113,7 @@ def _real_time(summary: Mapping[str, Any]) -> Iterator[tuple[str, str | None]]:
         ):
             tally = live["delays"][stage]
             if tally["count"]:
-                yield f"delay of {counted(tally['count'], what)}, {since}: {delays_text(tally)}", None
+                yield f"delay of {format_count(tally['count'], what)}, {since}: {delays_text(tally)}", None
         if left := [f"{many} {name.replace('_', ' ')}" for name, many in live["shed"].items() if many]:
             yield f"left out, as there was no time: {', '.join(left)}", "yellow"
     pps = summary.get("pps")
@@ -167,7 +167,7 @@ def _erased(told: Mapping[str, Any]) -> str:
 
 def _positions(told: Mapping[str, Any]) -> str:
     """How many positions there are, and why not more, in one line."""
-    text = counted(told["fixes"], "position")
+    text = format_count(told["fixes"], "position")
     if told["fixes_verified"]:
         text += f", {told['fixes_verified']} verified"
     if told["gnss"]:
@@ -195,7 +195,7 @@ def _messages(counts: Mapping[str, int]) -> str:
     if not counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0):
         return ""
     number = counts["messages"]
-    text = counted(number, "message")
+    text = format_count(number, "message")
     trusts = {t: counts[f"beacons_{t}"] for t in ("verified", "unverified", "forged")}
     if any(trusts.values()):
         text += f"; beacons {', '.join(_times(n, t) for t, n in trusts.items() if n)}"
@@ -210,7 +210,7 @@ def _messages(counts: Mapping[str, int]) -> str:
         ("messages_undecodable", "message", "without meaning"),
     ):
         if counts[key]:
-            text += f"; {counted(counts[key], what)} {lost}"
+            text += f"; {format_count(counts[key], what)} {lost}"
     return text
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, print_json
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.calibration import Calibrated
@@ -76,7 +76,7 @@ def _table(found: Calibrated) -> dict[str, Any]:
 def _toml(found: Calibrated, poses: int) -> str:
     """The tables `[camera]` and `[camera_sigma]`; as comments what was not determined."""
     lines = [
-        f"# {counted(found.views, 'view')}, {counted(found.points, 'point')},"
+        f"# {format_count(found.views, 'view')}, {format_count(found.points, 'point')},"
         f" misses of {found.misfit**0.5:.2f} sigmas (rms)",
         *([f"# {poses - found.views} of {poses} poses show no bar"] if poses > found.views else []),
         "[camera]",

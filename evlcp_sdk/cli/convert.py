@@ -9,7 +9,7 @@ import typer
 
 from evlcp_sdk.cli._common import Json, bytes_bar, echo, print_json
 from evlcp_sdk.cli._complain import complain
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 
 
 def convert(
@@ -55,7 +55,7 @@ def convert(
     else:
         counts = told["counts"]
         lost = [f"{one['count']} {one['meaning']}" for one in told["losses"].values()]
-        what = [counted(counts["events"], "event"), counted(counts["triggers"], "trigger"), *lost]
+        what = [format_count(counts["events"], "event"), format_count(counts["triggers"], "trigger"), *lost]
         echo(f"{out}: {', '.join(what)}")
     if told["error"] is not None:
         complain(told["error"])

@@ -24,18 +24,18 @@ _FIRST_S = 0.06
 
 def demo_files() -> tuple[Path, Path]:
     """The demo's recording and its truth: in the wheel, or in a checkout's `examples/recordings`."""
-    from evlcp_sdk.files import shipped
+    from evlcp_sdk.files import find_shipped_file
     from evlcp_sdk.sim.truth import truth_path
 
-    raw = shipped("recordings", f"{DEMO_NAME}.raw")
+    raw = find_shipped_file("recordings", f"{DEMO_NAME}.raw")
     return raw, truth_path(raw)
 
 
 def demo_campaign() -> Path:
     """The demo's campaign: in the wheel, or in a checkout's `examples/campaigns`."""
-    from evlcp_sdk.files import shipped
+    from evlcp_sdk.files import find_shipped_file
 
-    return shipped("campaigns", f"{CAMPAIGN_NAME}.toml")
+    return find_shipped_file("campaigns", f"{CAMPAIGN_NAME}.toml")
 
 
 def demo(

@@ -40,10 +40,10 @@ def main() -> None:
     try:
         from signal import SIGHUP, SIGTERM
 
-        from evlcp_sdk.signals import heard_by, interrupt
+        from evlcp_sdk.signals import handle_signals, interrupt
 
         # Python itself handles Ctrl-C.
-        with heard_by(interrupt, SIGTERM, SIGHUP):
+        with handle_signals(interrupt, SIGTERM, SIGHUP):
             from evlcp_sdk.cli._app import run
 
             run()
@@ -73,14 +73,14 @@ def _interrupt(_frame: object, event: str, _of: object) -> None:
 
 def _report_fault(fault: BaseException) -> int:
     """Say what went wrong; the exit code."""
-    from evlcp_sdk.errors import explained
+    from evlcp_sdk.errors import explain_fault
 
     # Our own files are written where their names are known, so what has none is stdout.
     if isinstance(fault, OSError) and fault.filename is None:
         complain(f"standard output: {fault.strerror or fault}")
         _drop_stdout()
         return _FAILED
-    message, code = explained(fault)
+    message, code = explain_fault(fault)
     complain(message)
     return code
 

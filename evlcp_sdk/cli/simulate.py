@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import Json, Overrides, console, echo, print_json, progress_bar
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 
 
 def simulate(
@@ -82,7 +82,7 @@ def _list_presets(*, as_json: bool) -> None:
 
 def _source_of(scene_file: str | None, preset: str | None) -> Path | str:
     """The scene that is meant: a file's path, or a preset's name."""
-    from evlcp_sdk.files import is_there
+    from evlcp_sdk.files import path_exists
     from evlcp_sdk.sim import preset_names, preset_text
 
     if (scene_file is None) == (preset is None):
@@ -91,7 +91,7 @@ def _source_of(scene_file: str | None, preset: str | None) -> Path | str:
         preset_text(preset)  # a file of that name is not meant
         return preset
     assert scene_file is not None
-    if scene_file in preset_names() and not is_there(scene_file):
+    if scene_file in preset_names() and not path_exists(scene_file):
         raise typer.BadParameter(
             f"{scene_file}: no such file; for the preset: --preset {scene_file}", param_hint="scene.toml"
         )
@@ -146,6 +146,7 @@ def _render(
     )
     if counts["dropped_by_rate_cap"]:
         screen.print(
-            f"lost to the event-rate limit: {counted(counts['dropped_by_rate_cap'], 'event')}", style="yellow"
+            f"lost to the event-rate limit: {format_count(counts['dropped_by_rate_cap'], 'event')}",
+            style="yellow",
         )
     screen.print(f"written: {', '.join(map(str, written))}", style="dim")

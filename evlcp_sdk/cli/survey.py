@@ -10,7 +10,7 @@ import typer
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, print_json
 from evlcp_sdk.cli._receiving import PlaceOptions
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -100,6 +100,6 @@ def _line(bar: SurveyedBar) -> str:
     kind = f" ({site.link})" if site.link else ""
     return (
         f"transmitter {site.transmitter_id}{kind}: {site.latitude_deg:.9f}, {site.longitude_deg:.9f} deg,"
-        f" {site.height_m:.3f} m, to {site.position_sigma_m:.3f} m, from {counted(bar.views, 'view')}"
+        f" {site.height_m:.3f} m, to {site.position_sigma_m:.3f} m, from {format_count(bar.views, 'view')}"
         + (f"; its beacon contradicts that: {bar.contradicted}" if bar.contradicted else "")
     )

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, print_json
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 
 From = Annotated[
     float | None,
@@ -82,7 +82,8 @@ def _show(told: dict[str, Any], name: str) -> None:
     """Say what was filmed."""
     screen = console()
     if told["frames"]:
-        found = f"{counted(len(told['transmitters']), 'transmitter')}, {counted(told['frames'], 'frame')}"
+        transmitters = format_count(len(told["transmitters"]), "transmitter")
+        found = f"{transmitters}, {format_count(told['frames'], 'frame')}"
     else:
         found = "no frame is decoded there"
     screen.print(

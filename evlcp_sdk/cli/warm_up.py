@@ -15,7 +15,7 @@ def warm_up(as_json: Json = False) -> None:
     """
     from dataclasses import asdict
 
-    from evlcp_sdk.suggestions import counted
+    from evlcp_sdk.suggestions import format_count
     from evlcp_sdk.warming import STEPS, warm_up as warm
 
     with progress_bar("compiling") as advance:
@@ -26,7 +26,7 @@ def warm_up(as_json: Json = False) -> None:
     if not warmth.compiled:
         console().print(f"nothing to compile; tried in {warmth.elapsed_s:.1f} s")
         return
-    console().print(f"{counted(warmth.compiled, 'kernel')} compiled in {warmth.elapsed_s:.0f} s")
+    console().print(f"{format_count(warmth.compiled, 'kernel')} compiled in {warmth.elapsed_s:.0f} s")
     if warmth.kept_in is None:
         console().print(
             "they cannot be kept, so each process compiles them again: give it a home, or a folder by"

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Found, in_ms
 from evlcp_sdk.diagnosis.tallies import SURE, TransmitterTally, count_missing_codewords
 from evlcp_sdk.rx.straight import ALIKE, err_together
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 
 FEW_FRAMES = 10
 """Frames of a packet by default: of fewer, nothing is said."""
@@ -168,7 +168,7 @@ def check_flooded(facts: Facts) -> Found:
 def check_reflection(_facts: Facts, one: TransmitterTally) -> Found:
     """A transmitter that is a reflection of another one."""
     if one.echoes and one.echo_of is not None:
-        text = f"a reflection of transmitter {one.echo_of}, {counted(one.echoes, 'frame')}"
+        text = f"a reflection of transmitter {one.echo_of}, {format_count(one.echoes, 'frame')}"
         step = "or a much weaker bar that says the same; in either case it is left out"
         yield Diagnostic("reflection", text, step, verdict="note")
 
@@ -190,7 +190,7 @@ def check_alike(facts: Facts) -> Found:
     """Bars that send the same at the same time: a warning where it matters which is which."""
     alike = facts.counts.get("frames_alike", 0)
     if alike:
-        frames = counted(alike, "frame")
+        frames = format_count(alike, "frame")
         text = f"{frames} of bars, or of a bright mirror, that send the same at the same time"
         asked = {"positions": facts.positions_tried, "messages": facts.tally.messages()}
         what = [name for name, found in asked.items() if found]
@@ -438,9 +438,9 @@ def check_messages(facts: Facts) -> Found:
         return
     counts, tried = facts.counts, facts.counts.get("blocks_tried", 0)
     if other := counts.get("blocks_other_codebook", 0):
-        text = f"{counted(other, 'packet')} sent with another codebook"
+        text = f"{format_count(other, 'packet')} sent with another codebook"
         yield Diagnostic("other-codebook", text, "compare both ends' `evlcp config`")
-    text = f"{facts.blocks_read or 'none'} of {counted(tried, 'packet')} with a block that can be read"
+    text = f"{facts.blocks_read or 'none'} of {format_count(tried, 'packet')} with a block that can be read"
     alike = counts.get("blocks_alike", 0)
     if not facts.blocks_read and alike >= _ALIKE:
         yield Diagnostic(

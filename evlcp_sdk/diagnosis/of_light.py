@@ -11,7 +11,7 @@ from evlcp_sdk.clock import TimeGrain
 from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Found, has_rate, in_ms
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import alike_links
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 
 if TYPE_CHECKING:
     from evlcp_sdk.diagnosis.light import LightSource
@@ -123,7 +123,7 @@ def check_times(facts: Facts) -> Found:
         yield Diagnostic("guessed", facts.guessed, step, verdict="note")
     silences, silent_us = facts.skipped
     if silences:
-        text = f"{counted(silences, 'silence')} of {silent_us * 1e-6:.1f} s in all"
+        text = f"{format_count(silences, 'silence')} of {silent_us * 1e-6:.1f} s in all"
         text += ", where the recording is damaged, not waited for"
         yield Diagnostic("pace", text, verdict="note")
 
@@ -198,7 +198,7 @@ def check_light(facts: Facts) -> Found:
         rates = ", ".join([_hz(one.rate_hz) for one in lamps[:4]] + ["..."] * (len(lamps) > 4))
         yield Diagnostic(
             "lamp",
-            f"{counted(len(lamps), 'lamp')} blinking ({rates}), nothing sends chips",
+            f"{format_count(len(lamps), 'lamp')} blinking ({rates}), nothing sends chips",
             "is a bar in the picture, and on (`evlcp board status`)?",
         )
         return
@@ -408,11 +408,12 @@ def check_preamble(facts: Facts) -> Found:
         ask = "" if facts.surveyed else "; `evlcp diagnose` says what blinks, and how fast"
         yield Diagnostic(
             code,
-            f"something blinks, {counted(blinking, 'event')} in {counted(regions, 'region')}, but no {what}",
+            f"something blinks, {format_count(blinking, 'event')} in {format_count(regions, 'region')},"
+            f" but no {what}",
             f"compare air.chip_rate_hz and {compare}{ask}",
         )
     elif looked_for:
-        yield f"{found} detected in {counted(regions, 'region')}"
+        yield f"{found} detected in {format_count(regions, 'region')}"
     else:
         yield Diagnostic("preamble", "not looked for: the link's framing has none", verdict="skip")
 
@@ -436,7 +437,9 @@ def check_coverage(facts: Facts) -> Found:
 def _describe_sources(facts: Facts) -> str:
     many = Counter[str](one.kind for one in facts.sources)
     names = {"code": "source", "lamp": "lamp", "unclear": "unclear source"}
-    words = [counted(many[k], name) + " of chips" * (k == "code") for k, name in names.items() if many[k]]
+    words = [
+        format_count(many[k], name) + " of chips" * (k == "code") for k, name in names.items() if many[k]
+    ]
     text = ", ".join(words) or "no source of its own"
     return f"{text}; what shines {_sweeps(facts)}" if facts.speed_px_ms else text
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, Found
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 
 _MOST_IDS = 5
 """Ids that a warning names; how many there are besides, it counts."""
@@ -45,7 +45,7 @@ def check_excluded(facts: Facts) -> Found:
     for name, number in facts.positions["excluded"].items():
         steps = [lens] if lens and name != "focal length" else []
         steps.append(_SUSPECTS.get(name, "its place, angles and length, and their sigmas"))
-        text = f"{counted(number, 'position')} without {name}, which the rest contradicts"
+        text = f"{format_count(number, 'position')} without {name}, which the rest contradicts"
         yield Diagnostic("excluded", text, f"compare {'; or '.join(steps)}")
 
 
@@ -79,7 +79,7 @@ def check_inputs(facts: Facts) -> Found:
             apart = f": it is {east} m east, {north} north, {up} up of them"
         yield Diagnostic(
             "gnss-contradicted",
-            f"{counted(number, 'time')} bars and GNSS contradict one another{apart}",
+            f"{format_count(number, 'time')} bars and GNSS contradict one another{apart}",
             "compare heights (above the ellipsoid), the sigmas of both, position.antenna_m, and both clocks",
         )
     clock = "t_us of its file has to be the camera's clock, us"
@@ -111,7 +111,7 @@ def check_sites(facts: Facts) -> Found:
     if (number := positions["refused"].get("no-site", 0)) and not positions["fixes"]:
         yield Diagnostic(
             "no-site",
-            f"{counted(number, 'position')} refused, as no bar in view stands at a known place;"
+            f"{format_count(number, 'position')} refused, as no bar in view stands at a known place;"
             f" received: {_ids(sorted(set(received.values()))) or 'no id'}",
             step,
         )
@@ -146,7 +146,7 @@ def check_misfits(facts: Facts) -> Found:
         likely["focal length"] = number + 1
         steps["focal length"] = lens
     names = sorted(likely, key=lambda name: -likely[name])
-    text = f"{counted(number, 'position')} refused, as bars, attitude and camera contradict one another"
+    text = f"{format_count(number, 'position')} refused, as bars, attitude and camera contradict one another"
     if names:
         text += f"; another {' or another '.join(names)} would explain it"
     what = "sites, angles and [camera], its focal_mm first, with what is there, and their sigmas"

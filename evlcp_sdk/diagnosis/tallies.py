@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.formatting import number_or_none, sigmas
+from evlcp_sdk.formatting import round_or_none, sigmas
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage
 
@@ -218,12 +218,12 @@ class TransmitterTally:
             "frames_echo": self.echoes,
             "symbols_given": self.given,
             "symbols_erased": self.erased,
-            "quality": number_or_none(self.quality_sum / self.frames if self.frames else math.nan, 4),
-            "clock_ppm": number_or_none(self.clock_ppm(), 2),
+            "quality": round_or_none(self.quality_sum / self.frames if self.frames else math.nan, 4),
+            "clock_ppm": round_or_none(self.clock_ppm(), 2),
             "frames_ranged": self.ranged,
-            "distance_first_m": number_or_none(self.first_m, 4),
-            "distance_last_m": number_or_none(self.last_m, 4),
-            "distance_median_m": number_or_none(self.median_m(), 2),
+            "distance_first_m": round_or_none(self.first_m, 4),
+            "distance_last_m": round_or_none(self.last_m, 4),
+            "distance_median_m": round_or_none(self.median_m(), 2),
         }
 
 
@@ -391,7 +391,7 @@ class PositionTally:
             "alarms": dict(sorted(self.alarms.items())),
             "excluded": dict(sorted(self.excluded.items())),
             "suspects": dict(sorted(self.suspects.items())),
-            "focal_mm_fits": number_or_none(positioner.fitting_focal_mm(), 2),
+            "focal_mm_fits": round_or_none(positioner.fitting_focal_mm(), 2),
             "left_out_of_track": self.left_out,
             **navigator.counts,
             "gnss_apart_m": None if navigator.apart_m is None else navigator.apart_m.round(3).tolist(),
@@ -414,7 +414,7 @@ def _last(fix: Fix) -> dict[str, Any]:
         "longitude_deg": round(fix.longitude_deg, 10),
         "height_m": round(fix.height_m, 4),
         "sigma_m": [round(value, 4) for value in sigmas(fix.covariance_m2)],
-        "heading_deg": number_or_none(fix.heading_deg, 4),
+        "heading_deg": round_or_none(fix.heading_deg, 4),
     }
 
 

@@ -15,7 +15,7 @@ from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import ChunkReader, RawSource, format_header
 from evlcp_sdk.io.urls import parse_flag, parse_positive, split_options
 from evlcp_sdk.plugin.source import Loss
-from evlcp_sdk.suggestions import nearest
+from evlcp_sdk.suggestions import suggest
 
 _MODULES: Final = {"PROPHESEE_EVK4": "prophesee_evk4", "PROPHESEE_EVK3_HD": "prophesee_evk3_hd"}
 """Devices that send EVT3, and the driver's module for each."""
@@ -252,7 +252,7 @@ def _make_configuration(url: str, kind: Any, options: Mapping[str, Any]) -> Any:
     known = [*_OPTIONS, *(field.name for field in fields(kind.Biases))]
     for name in options:
         if name not in known:
-            raise InputError(f"{url}: option {name!r}{nearest(name, known)}")
+            raise InputError(f"{url}: option {name!r}{suggest(name, known)}")
     biases = {name: value for name, value in options.items() if name not in _OPTIONS}
     settings: dict[str, Any] = {"biases": replace(kind.Biases(), **biases)}
     if "trigger" in options:

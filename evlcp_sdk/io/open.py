@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import unquote
 
 from evlcp_sdk.errors import EvlcpError, InputError, StreamError
-from evlcp_sdk.files import Outputs, is_there
+from evlcp_sdk.files import Outputs, path_exists
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
 from evlcp_sdk.io.streams import SCHEMES, open_stream
@@ -44,7 +44,7 @@ _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 def _find_scheme(url: str) -> str:
     """Return the scheme before the `:` of a name, empty for a file or no scheme."""
     found = _SCHEME.match(url)
-    return "" if found is None or is_there(url) else found[1].lower()
+    return "" if found is None or path_exists(url) else found[1].lower()
 
 
 def is_recording(url: Path | str) -> bool:

@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io.evt import MAX_SIDE
-from evlcp_sdk.suggestions import nearest
+from evlcp_sdk.suggestions import suggest
 
 
 def split_options(url: str, parsers: Mapping[str, Callable[[str], Any]]) -> tuple[str, dict[str, Any]]:
@@ -32,7 +32,7 @@ def split_options(url: str, parsers: Mapping[str, Callable[[str], Any]]) -> tupl
     values: dict[str, Any] = {}
     for key, text in parse_qsl(query, keep_blank_values=True) or [(query, "")]:
         if key not in parsers:
-            raise InputError(f"{url}: option {key!r}{nearest(key, list(parsers))}")
+            raise InputError(f"{url}: option {key!r}{suggest(key, list(parsers))}")
         if key in values:
             raise InputError(f"{url}: option {key!r} is given twice")
         try:

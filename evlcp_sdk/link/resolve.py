@@ -37,8 +37,8 @@ from evlcp_sdk.plugin.roles import (
 )
 from evlcp_sdk.scene.bar import BarLayout, read_leds
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
-from evlcp_sdk.specs import SpecError, build, parse_value, read_toml, shown
-from evlcp_sdk.suggestions import hinted, nearest
+from evlcp_sdk.specs import SpecError, build_spec, format_value, parse_value, read_toml
+from evlcp_sdk.suggestions import add_check_hint, suggest
 
 _SPECS: dict[str, type[Any]] = {
     "camera": CameraModel,
@@ -158,7 +158,7 @@ class Link:
         'mine'
         """
         if role not in ROLES:
-            raise ConfigError(f"no role named '{role}'{nearest(role, list(ROLES))}")
+            raise ConfigError(f"no role named '{role}'{suggest(role, list(ROLES))}")
         if role != "framing":
             # Says so where it is no step of the link's framing.
             self.algorithm(role)
@@ -314,7 +314,7 @@ class _Resolver:
         """Find sections that there are not, or that are no tables."""
         for section, keys in self._table.items():
             if section not in _KNOWN:
-                self._fault(section, self._key_set(section), f": unknown table{nearest(section, _KNOWN)}")
+                self._fault(section, self._key_set(section), f": unknown table{suggest(section, _KNOWN)}")
             elif not isinstance(keys, Mapping):
                 self._fault(section, None, f" = {keys!r}: expected a table")
 
@@ -388,7 +388,7 @@ class _Resolver:
 
 def _built(cls: type[Any], keys: Mapping[str, Any], *, ours: bool) -> Any:
     """What a section describes; our own defaults are held by a test, and need no model to be checked."""
-    return build(cls, keys) if keys or not ours else cls()
+    return build_spec(cls, keys) if keys or not ours else cls()
 
 
 def with_leds(table: Mapping[str, Any], folder: Path = Path(), before: str = "") -> dict[str, Any]:
@@ -408,9 +408,9 @@ def with_leds(table: Mapping[str, Any], folder: Path = Path(), before: str = "")
     keys = dict(bar)
     name = keys.pop("leds_file")
     if not isinstance(name, str):
-        raise ConfigError(f"{before}bar.leds_file = {shown(name)}: expected the name of a CSV file")
+        raise ConfigError(f"{before}bar.leds_file = {format_value(name)}: expected the name of a CSV file")
     if "leds" in keys:
-        raise ConfigError(f"{before}bar.leds_file = {shown(name)}: expected it, or bar.leds, not both")
+        raise ConfigError(f"{before}bar.leds_file = {format_value(name)}: expected it, or bar.leds, not both")
     try:
         keys["leds"] = read_leds(folder / name)
     except (ConfigError, InputError) as fault:
@@ -469,7 +469,7 @@ def _codes_of_roles(parts: Mapping[str, Any], table: Mapping[str, Mapping[str, A
     except ConfigError as fault:
         role = "modulation" if str(fault).startswith("codebook codewords") else "pilots"
         id = table[role]["id"]
-        raise ConfigError(hinted(f"{role} algorithm '{id}': {fault}", role, id)) from fault
+        raise ConfigError(add_check_hint(f"{role} algorithm '{id}': {fault}", role, id)) from fault
     with _named("modulation", table):
         _check_alphabet(codebook)
     return codebook
@@ -505,7 +505,7 @@ def _named(role: str, table: Mapping[str, Mapping[str, Any]]) -> Iterator[None]:
         raise
     except (Exception, SystemExit) as fault:
         id, what = table[role]["id"], f"{type(fault).__name__}: {fault}".splitlines()[0]
-        raise PluginError(hinted(f"{role} algorithm '{id}': {what}", role, id)) from fault
+        raise PluginError(add_check_hint(f"{role} algorithm '{id}': {what}", role, id)) from fault
 
 
 def _parse_override(text: str) -> tuple[str, str, Any]:

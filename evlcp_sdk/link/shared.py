@@ -5,7 +5,7 @@ import numpy as np
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import packet_bits
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.specs import shown
+from evlcp_sdk.specs import format_value
 
 _MESSAGES_TRIED = 4
 
@@ -76,7 +76,7 @@ def _section(sent: Link, received: Link, role: str) -> list[str]:
     role = role if role in sent.table else "framing"
     name, a, b = sent.table[role]["id"], sent.revisions[role], received.revisions[role]
     which = f"revision {a}, received with revision {b}" if a != b else "other codes than those received with"
-    return [f"{role}.id = {shown(name)}: sent with {which}"]
+    return [f"{role}.id = {format_value(name)}: sent with {which}"]
 
 
 def _settings(sent: Link, received: Link, role: str) -> list[str]:
@@ -89,5 +89,7 @@ def _settings(sent: Link, received: Link, role: str) -> list[str]:
 def _keys(sent: Link, received: Link, section: str, *keys: str) -> list[str]:
     values = ((key, sent.table[section].get(key), received.table[section].get(key)) for key in keys)
     return [
-        f"{section}.{key}: sent with {shown(a)}, received with {shown(b)}" for key, a, b in values if a != b
+        f"{section}.{key}: sent with {format_value(a)}, received with {format_value(b)}"
+        for key, a, b in values
+        if a != b
     ]

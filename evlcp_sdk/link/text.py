@@ -7,7 +7,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.bar import SHAPES, BarLayout
-from evlcp_sdk.specs import spec_model, toml_value
+from evlcp_sdk.specs import make_model, to_toml_value
 
 _UNITS = {
     "deg_s": "deg/s",
@@ -41,7 +41,7 @@ def _toml_lines(link: Link, registry: Registry) -> Iterator[str]:
     for section, values in link.table.items():
         thing = link.algorithms.get(section) or getattr(link, section)
         cls = type(thing.shape if isinstance(thing, BarLayout) else thing)
-        schema = spec_model(cls).model_json_schema()["properties"]
+        schema = make_model(cls).model_json_schema()["properties"]
         yield f"# {_first_line(cls)}"
         yield f"[{section}]"
         if section == "camera_sigma" and thing == cls():
@@ -57,7 +57,7 @@ def _toml_lines(link: Link, registry: Registry) -> Iterator[str]:
         for key, value in values.items():
             if key in schema:
                 yield f"# {_comment(key, schema[key])}"
-                yield f"# {key} =" if value is None else f"{key} = {toml_value(value)}"
+                yield f"# {key} =" if value is None else f"{key} = {to_toml_value(value)}"
         yield ""
 
 
@@ -73,11 +73,11 @@ def _comment(key: str, schema: Mapping[str, Any]) -> str:
         )
         if name in schema
     ]
-    choices = [" | ".join(toml_value(c) for c in schema["enum"])] if "enum" in schema else []
+    choices = [" | ".join(to_toml_value(c) for c in schema["enum"])] if "enum" in schema else []
     value = schema.get("default")
     if value is not None and schema.get("type") == "number":
         value = float(value)
-    default = "none" if value is None else toml_value(value)
+    default = "none" if value is None else to_toml_value(value)
     facts = ", ".join([*([unit] if unit else []), *bounds, *choices, f"default {default}"])
     text = str(schema.get("description", "")).strip()
     return f"{text} [{facts}]" if text else f"[{facts}]"

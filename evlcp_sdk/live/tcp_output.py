@@ -10,7 +10,7 @@ from evlcp_sdk.live.publisher import News, Publisher
 from evlcp_sdk.live.server import Server
 from evlcp_sdk.results.gpsd import VERSION, answer, sky, tpv
 from evlcp_sdk.results.nmea import sentences
-from evlcp_sdk.utc import ClockZero, zero_at
+from evlcp_sdk.utc import ClockZero, clock_zero_at
 
 _HOST: Final = "127.0.0.1"
 _KINDS: Final = frozenset({"fix", "status"})
@@ -79,7 +79,7 @@ class TcpOutput(Server):
         if news.kind != "fix" or not (self._clients or self._gpsd):
             return
         fix, place = news.value.fix, news.value.filtered
-        zero = zero_at(self._zero, fix.t_us)
+        zero = clock_zero_at(self._zero, fix.t_us)
         text = b""
         if any(watch["nmea"] for watch in self._clients.values()):
             text = sentences(fix, place, zero).encode("ascii", "replace")

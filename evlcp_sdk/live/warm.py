@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from evlcp_sdk.files import shipped
+from evlcp_sdk.files import find_shipped_file
 from evlcp_sdk.io.raw import RawSource
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.pictures import PictureSlot
@@ -39,7 +39,7 @@ def warm_up(links: Sequence[Link], *, positions: bool = False) -> None:
             _find_place(link)
     for shaking in (False, True):
         receiver, pictures, camera = Receiver(links), PictureSlot(), links[0].camera
-        with RawSource(shipped("recordings", "night-50m-30kmh-cut.raw")) as source:
+        with RawSource(find_shipped_file("recordings", "night-50m-30kmh-cut.raw")) as source:
             first_us = None
             for events in source.chunks(1 << 14):
                 first_us = int(events.t_us[0]) if first_us is None else first_us

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import check_columns, csv_number, read_csv
+from evlcp_sdk.files import check_columns, parse_csv_number, read_csv
 from evlcp_sdk.place.error_model import USUAL, ErrorModel
 from evlcp_sdk.place.gnss import PLACE
 from evlcp_sdk.place.observations import BarView, between_of, camera_off, project_bars, shared_errors
@@ -83,7 +83,7 @@ def read_poses(path: Path | str) -> list[KnownPose]:
         angles = any(row.get(name) for name in _ANGLES)
         needed = ("t_us", *PLACE, *(_ANGLES if angles else ()))
         given = [name for name in _RANGES if name in needed or row.get(name)]
-        value = {name: csv_number(path, line, name, row.get(name), _RANGES[name]) for name in given}
+        value = {name: parse_csv_number(path, line, name, row.get(name), _RANGES[name]) for name in given}
         poses.append(
             KnownPose(
                 row.get("recording") or "",

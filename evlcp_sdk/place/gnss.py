@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import ANY_NUMBER, check_rising, csv_number, read_table, read_whole
+from evlcp_sdk.files import ANY_NUMBER, check_rising, parse_csv_number, read_bytes, read_table
 from evlcp_sdk.place.error_model import ErrorModel, symmetric_root
 from evlcp_sdk.place.trajectory import GNSS
 from evlcp_sdk.scene.attitude import Attitude
@@ -95,7 +95,7 @@ def read_nmea(path: Path | str, clock_zero: datetime, usual_sigma_m: float) -> "
     last = clock_zero.timestamp()
 
     def value(field: int, name: str, within: tuple[float, float], piece: slice = slice(None)) -> float:
-        return csv_number(path, line, name, fields[field][piece], within)
+        return parse_csv_number(path, line, name, fields[field][piece], within)
 
     def angle(field: int, name: str, signs: str) -> float:
         """Degrees of ddmm.mmm and its sign, which is the next field."""
@@ -159,7 +159,7 @@ def read_nmea(path: Path | str, clock_zero: datetime, usual_sigma_m: float) -> "
 
 def _sentences(path: Path | str) -> Iterator[tuple[int, str, list[str]]]:
     """Line, kind and fields of each sentence, of which there are 15 or more: empty ones are added."""
-    for line, text in enumerate(read_whole(path).decode("ascii", "replace").splitlines(), 1):
+    for line, text in enumerate(read_bytes(path).decode("ascii", "replace").splitlines(), 1):
         if not text.strip():
             continue
         body, _, given = text.strip().removeprefix("$").partition("*")

@@ -24,7 +24,7 @@ from evlcp_sdk.place.trajectory import (
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.suggestions import nearest
+from evlcp_sdk.suggestions import suggest
 from evlcp_sdk.values import Fix, Packet
 
 Floats = NDArray[np.float64]
@@ -144,7 +144,7 @@ class PositionPlan:
             if site.link is not None and site.link not in names:
                 raise ConfigError(
                     f"site of id {site.transmitter_id}: link = '{site.link}': no link is named so"
-                    + nearest(site.link, names, "links")
+                    + suggest(site.link, names, "links")
                 )
 
 

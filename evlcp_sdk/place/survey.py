@@ -20,7 +20,7 @@ from evlcp_sdk.place.navigator import Navigator, Placed, Settled
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 from evlcp_sdk.values import Packet
 
 Floats = NDArray[np.float64]
@@ -80,7 +80,7 @@ class OwnPoses:
         refused = "".join(f", {count} refused ({why})" for why, count in self._refused.most_common())
         ids = self._navigator.positioner.bars.ids
         new = ", ".join(str(ids.get(number, "without an id")) for number in self._new()) or "none"
-        return f"{counted(self._given, 'position')}{refused}; new bars: {new}"
+        return f"{format_count(self._given, 'position')}{refused}; new bars: {new}"
 
     def _settle(self, placed: Iterable[Placed]) -> None:
         for one in placed:

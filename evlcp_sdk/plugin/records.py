@@ -9,7 +9,7 @@ from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.hooks import SinkRecord
 from evlcp_sdk.plugin.registry import Owner, Registry, load_target
-from evlcp_sdk.suggestions import nearest
+from evlcp_sdk.suggestions import suggest
 
 SUMMARY = "summary.json"
 """What every result has: no sink writes it."""
@@ -64,7 +64,7 @@ def choose_sinks(registry: Registry, names: Sequence[str], *, positions: bool) -
     sinks = installed_sinks(registry)
     for name in names:
         if name not in sinks:
-            raise ConfigError(f"no sink named '{name}'{nearest(name, sorted(sinks), 'installed')}")
+            raise ConfigError(f"no sink named '{name}'{suggest(name, sorted(sinks), 'installed')}")
         if sinks[name].record.positions and not positions:
             raise ConfigError(f"sink '{name}' needs --sites: it writes positions")
     return [

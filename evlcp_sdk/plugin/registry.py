@@ -21,7 +21,7 @@ from evlcp_sdk.errors import PluginError, PluginWarning, UnknownAlgorithmError
 from evlcp_sdk.plugin import hooks as hookspecs
 from evlcp_sdk.plugin.hooks import ENTRY_POINT_GROUP, Algorithm
 from evlcp_sdk.plugin.roles import ROLES
-from evlcp_sdk.suggestions import nearest
+from evlcp_sdk.suggestions import suggest
 
 T = TypeVar("T")
 Owner = tuple[str, str]
@@ -226,7 +226,7 @@ class Registry:
         names = [e.algorithm.id for e in self.installed(role)]
         lost = "".join(f"; {broken}" for broken in self._broken if not broken.algorithms)
         raise UnknownAlgorithmError(
-            f"no {role} algorithm named '{id}'{nearest(id, names, 'installed')}{lost}"
+            f"no {role} algorithm named '{id}'{suggest(id, names, 'installed')}{lost}"
         )
 
     def load_class(self, role: str, id: str) -> type[Any]:

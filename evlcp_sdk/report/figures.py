@@ -30,7 +30,7 @@ from evlcp_sdk.report.recording import (
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 _DPI = 150
@@ -103,7 +103,9 @@ class Figures(Kept):
         if self.run.navigator is not None:
             points = [*self.track]
             plots = plot_positions(points, self.run.navigator.bars_enu_m(), seconds_since(0.0))
-            self._save(draw_plots(plots, f"{name}: {counted(len(points), 'position')} shown"), "track.png")
+            self._save(
+                draw_plots(plots, f"{name}: {format_count(len(points), 'position')} shown"), "track.png"
+            )
         return {}
 
     def _save(self, figure: Figure, name: str) -> None:
@@ -121,7 +123,7 @@ def draw_regions(kept: Figures, title: str) -> Figure:
     picture = colormaps["Greys"](np.clip(shades / np.float32(math.log1p(top)), 0, 1), bytes=True)
     axis.imshow(picture, interpolation="nearest")
     axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="column, px", ylabel="row, px")
-    many = counted(kept.many_regions, "region")
+    many = format_count(kept.many_regions, "region")
     if kept.many_regions > len(kept.regions):
         many += f", {len(kept.regions)} shown"
     titled(axis, f"{title}: {kept.image.sum():,} events, {many}")

@@ -29,7 +29,7 @@ from evlcp_sdk.report.recording import (
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 from evlcp_sdk.values import Frame, Packet, ReceivedMessage
 
 _MOST_MESSAGES = 50
@@ -117,7 +117,7 @@ class Report(Kept):
             axis=axis,
             books={number: self.run.link_of(seen.link).codebook for number, seen in self.seen.items()},
             name_transmitter=name_transmitter,
-            counted=counted,
+            counted=format_count,
         )
         self.folder.open("report.html").write(page)
 

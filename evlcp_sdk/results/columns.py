@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Literal
 
 from evlcp_sdk.errors import ConfigError, import_extra
-from evlcp_sdk.formatting import sigmas, symbol_list, text_or_empty
+from evlcp_sdk.formatting import format_or_empty, list_symbols, sigmas
 from evlcp_sdk.values import Alternative, Fix, Frame, Packet
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def frame_value(frame: Frame, column: str) -> Any:
     """
     match column:
         case "symbols":
-            return symbol_list(frame.soft.symbols)
+            return list_symbols(frame.soft.symbols)
         case "quality":
             return frame.soft.quality
         case "distance_m":
@@ -77,8 +77,8 @@ def frame_value(frame: Frame, column: str) -> Any:
 def place_row(place: Alternative | Fix | Place) -> list[str]:
     """A place as text, by `PLACE_COLUMNS`; empty for what is not known."""
     return [
-        *(text_or_empty(value, 10) for value in (place.latitude_deg, place.longitude_deg)),
-        *(text_or_empty(value, 4) for value in (place.height_m, *sigmas(place.covariance_m2))),
+        *(format_or_empty(value, 10) for value in (place.latitude_deg, place.longitude_deg)),
+        *(format_or_empty(value, 4) for value in (place.height_m, *sigmas(place.covariance_m2))),
         *(f"{v:.6g}" if math.isfinite(v) else "" for v in place.covariance_m2[[0, 0, 1], [1, 2, 2]].tolist()),
     ]
 

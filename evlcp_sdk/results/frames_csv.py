@@ -3,7 +3,7 @@
 import csv
 from typing import Any
 
-from evlcp_sdk.formatting import text_or_empty
+from evlcp_sdk.formatting import format_or_empty
 from evlcp_sdk.results.columns import frame_columns, frame_value
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
@@ -32,7 +32,7 @@ _DIGITS = {"t_us": 2, "quality": 4, "x_px": 3, "y_px": 3}
 def _text(column: str, value: Any) -> str:
     """A value as text; empty where there is none, `-` for a symbol not given."""
     if isinstance(value, float):
-        return text_or_empty(value, _DIGITS.get(column, 4))
+        return format_or_empty(value, _DIGITS.get(column, 4))
     if isinstance(value, list):
         return " ".join(["-" if symbol is None else str(symbol) for symbol in value])
     return "" if value is None else str(value)

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from evlcp_sdk.formatting import integrity, number_or_none, sigmas
+from evlcp_sdk.formatting import integrity_fields, round_or_none, sigmas
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
@@ -27,19 +27,19 @@ class GeoJson(Sink):
         if filtered is None:
             if fix.alarms:
                 why = {"t_us": round(fix.t_us, 1), "bars": list(fix.transmitters), "detail": fix.detail}
-                self._feature(None, [], why | integrity(fix))
+                self._feature(None, [], why | integrity_fields(fix))
             return
         self._feature(
             "Point",
             [round(fix.longitude_deg, 9), round(fix.latitude_deg, 9), round(fix.height_m, 4)],
             {
                 "t_us": round(fix.t_us, 1),
-                "heading_deg": number_or_none(fix.heading_deg, 3),
+                "heading_deg": round_or_none(fix.heading_deg, 3),
                 "sigma_m": [round(value, 4) for value in sigmas(fix.covariance_m2)],
                 "covariance_m2": [[float(f"{v:.6g}") for v in row] for row in fix.covariance_m2.tolist()],
                 "bars": list(fix.transmitters),
                 "verified": fix.verified,
-                **integrity(fix),
+                **integrity_fields(fix),
             },
         )
 

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from evlcp_sdk.formatting import integrity, number_or_none, sigmas, symbol_list
+from evlcp_sdk.formatting import integrity_fields, list_symbols, round_or_none, sigmas
 from evlcp_sdk.results.columns import FRAME_COLUMNS, frame_columns, frame_value
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.values import Fix, Frame, Packet
@@ -60,7 +60,7 @@ def format_frame(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> str:
     # Written out, as there are hundreds a second: rounding and `json` take twice as long.
     numbers = (
         f'{{"line": "frame", "transmitter": {frame.transmitter}, "packet": {frame.packet},'
-        f' "frame": {frame.frame}, "t_us": {frame.t_us:.2f}, "symbols": {symbol_list(soft.symbols)},'
+        f' "frame": {frame.frame}, "t_us": {frame.t_us:.2f}, "symbols": {list_symbols(soft.symbols)},'
         f' "quality": {soft.quality:.4f}, "distance_m": {found.distance_m:.4f},'
         f' "distance_sigma_m": {found.sigma_m:.4f}, "x_px": {frame.x_px:.3f}, "y_px": {frame.y_px:.3f},'
         f' "echo_of": {frame.echo_of}'
@@ -70,7 +70,7 @@ def format_frame(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> str:
     )
     for name in columns[len(FRAME_COLUMNS) :]:
         value = frame_value(frame, name)
-        text += f', "{name}": {json.dumps(number_or_none(value, 4) if isinstance(value, float) else value)}'
+        text += f', "{name}": {json.dumps(round_or_none(value, 4) if isinstance(value, float) else value)}'
     return text + "}"
 
 
@@ -79,14 +79,14 @@ def fix_line(fix: Fix) -> dict[str, Any]:
     return {
         "line": "fix",
         "t_us": round(fix.t_us, 1),
-        "latitude_deg": number_or_none(fix.latitude_deg, 10),
-        "longitude_deg": number_or_none(fix.longitude_deg, 10),
-        "height_m": number_or_none(fix.height_m, 4),
-        "sigma_m": [number_or_none(value, 4) for value in sigmas(fix.covariance_m2)],
-        "heading_deg": number_or_none(fix.heading_deg, 4),
+        "latitude_deg": round_or_none(fix.latitude_deg, 10),
+        "longitude_deg": round_or_none(fix.longitude_deg, 10),
+        "height_m": round_or_none(fix.height_m, 4),
+        "sigma_m": [round_or_none(value, 4) for value in sigmas(fix.covariance_m2)],
+        "heading_deg": round_or_none(fix.heading_deg, 4),
         "bars": list(fix.transmitters),
         "verified": fix.verified,
         "refusal": fix.refusal,
         "detail": fix.detail,
-        **integrity(fix),
+        **integrity_fields(fix),
     }

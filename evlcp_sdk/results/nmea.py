@@ -21,7 +21,7 @@ from evlcp_sdk.place.gnss import checksum, geoid_m
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.utc import zero_at
+from evlcp_sdk.utc import clock_zero_at
 from evlcp_sdk.values import FailedBar, Fix
 
 _KNOTS_PER_M_S = 3600 / 1852
@@ -39,7 +39,7 @@ class Nmea(Sink):
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write its sentences; those of a refused fix have no place."""
-        self._file.write(sentences(fix, filtered, zero_at(self.run.clock_zero, fix.t_us)))
+        self._file.write(sentences(fix, filtered, clock_zero_at(self.run.clock_zero, fix.t_us)))
 
 
 def sentences(fix: Fix, filtered: Place | None, zero: datetime | None) -> str:

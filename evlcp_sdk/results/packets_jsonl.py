@@ -4,7 +4,7 @@ import json
 from typing import Any
 
 from evlcp_sdk.errors import PluginError
-from evlcp_sdk.formatting import characters, symbol_list
+from evlcp_sdk.formatting import decode_characters, list_symbols
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
@@ -36,7 +36,7 @@ def packet_line(packet: Packet, link: Link) -> dict[str, Any]:
     unknown, ones = "?" * each, (1 << each) - 1
     bits = [unknown * codebook.clusters] * packet.sent
     for frame in packet.frames:
-        decoded = symbols[frame.frame] = symbol_list(frame.soft.symbols)
+        decoded = symbols[frame.frame] = list_symbols(frame.soft.symbols)
         bits[frame.frame] = "".join([unknown if s is None else f"{s & ones:0{each}b}" for s in decoded])
     return {
         "kind": "packet",
@@ -50,7 +50,11 @@ def packet_line(packet: Packet, link: Link) -> dict[str, Any]:
         "frames_received": len(packet.frames),
         "symbols": symbols,
         "bits": "".join(bits),
-        **({"text": characters(s[0] if s else None for s in symbols)} if link.characters_on_air else {}),
+        **(
+            {"text": decode_characters(s[0] if s else None for s in symbols)}
+            if link.characters_on_air
+            else {}
+        ),
     }
 
 

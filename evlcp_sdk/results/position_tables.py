@@ -4,8 +4,8 @@ import csv
 from collections.abc import Sequence
 from typing import ClassVar
 
-from evlcp_sdk.files import defused
-from evlcp_sdk.formatting import text_or_empty
+from evlcp_sdk.files import escape_formula
+from evlcp_sdk.formatting import format_or_empty
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.place.points import bar_point
@@ -48,16 +48,16 @@ class FixesCsv(_Table):
             [
                 f"{fix.t_us:.1f}",
                 *place_row(fix),
-                *(text_or_empty(v, 4) for v in (fix.heading_deg, fix.heading_sigma_deg)),
-                *(text_or_empty(v, 4) for v in (fix.pitch_deg, fix.roll_deg)),
+                *(format_or_empty(v, 4) for v in (fix.heading_deg, fix.heading_sigma_deg)),
+                *(format_or_empty(v, 4) for v in (fix.pitch_deg, fix.roll_deg)),
                 " ".join(map(str, fix.transmitters)),
                 int(fix.verified),
-                text_or_empty(fix.misfit, 4),
+                format_or_empty(fix.misfit, 4),
                 fix.freedom,
-                *(text_or_empty(v, 3) for v in (fix.hpl_m, fix.vpl_m)),
+                *(format_or_empty(v, 3) for v in (fix.hpl_m, fix.vpl_m)),
                 "; ".join(fix.excluded),
                 " ".join(fix.alarms),
-                *(defused(fix.refusal), defused(fix.detail), fix.source),
+                *(escape_formula(fix.refusal), escape_formula(fix.detail), fix.source),
                 " ".join(fix.contradicted),
                 *([] if navigator is None else [navigator.positioner.links_of(fix)]),
             ]
@@ -105,7 +105,7 @@ class TrackCsv(_Table):
                     *(f"{smoothed.speed_m_s:.3f}", f"{smoothed.course_deg:.2f}"),
                     *place_row(one.filtered),
                     *(int(one.filtered.left_out), one.fix.source),
-                    *(text_or_empty(v, 6) for v in (smoothed.focal_share, smoothed.focal_share_sigma)),
+                    *(format_or_empty(v, 6) for v in (smoothed.focal_share, smoothed.focal_share_sigma)),
                 ]
             )
 

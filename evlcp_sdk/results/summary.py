@@ -9,7 +9,7 @@ from evlcp_sdk.diagnosis.checks import run_checks
 from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import writing
-from evlcp_sdk.formatting import characters
+from evlcp_sdk.formatting import decode_characters
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.records import SUMMARY
 from evlcp_sdk.plugin.source import Loss
@@ -96,7 +96,7 @@ def _text(figures: Mapping[str, Any], facts: Facts) -> dict[str, Any]:
     one = facts.tally.transmitters[figures["transmitter"]]
     if not part.link.characters_on_air or one.blocks:
         return {}
-    return {"text": characters(one.firsts)}
+    return {"text": decode_characters(one.firsts)}
 
 
 def _describe(link: Link) -> dict[str, Any]:

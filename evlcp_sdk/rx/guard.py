@@ -18,7 +18,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Filter, Tracker
-from evlcp_sdk.suggestions import hinted
+from evlcp_sdk.suggestions import add_check_hint
 from evlcp_sdk.values import Curvature, PresenceMap, Range, SoftSymbols, SyncLock
 
 _FAR_PACKETS = 64
@@ -81,7 +81,7 @@ class Guard:
         raise PluginError(self._message(f": gave {gave}, expected {expected}"))
 
     def _message(self, what: str) -> str:
-        return hinted(f"{self._role} algorithm '{self._id}'{what}", self._role, self._id)
+        return add_check_hint(f"{self._role} algorithm '{self._id}'{what}", self._role, self._id)
 
     def expect(self, found: object, kind: type) -> None:
         """Check the type of what an algorithm gave."""

@@ -16,7 +16,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.trust import BeaconJudge, Standing, signed_text
-from evlcp_sdk.utc import ClockZero, zero_at
+from evlcp_sdk.utc import ClockZero, clock_zero_at
 from evlcp_sdk.values import Packet, ReceivedMessage, replace_fields
 
 _LLR_POWER, _MOST_LLR = 0.5, 7.0
@@ -276,7 +276,7 @@ class MessageAssembler:
         beacon = value if message.kind == Kind.BEACON else None
         verdict, now_s = Standing("unverified", "not signed"), None
         if message.kind in (Kind.BEACON, Kind.TIME):
-            zero = zero_at(self._clock_zero, packet.t_us)
+            zero = clock_zero_at(self._clock_zero, packet.t_us)
             now_s = None if zero is None else zero.timestamp() + packet.t_us * 1e-6
         if beacon is not None:
             signed = inbox.done.get((transmitter_id, Kind.SIGNATURE, sequence))

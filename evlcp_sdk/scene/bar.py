@@ -14,8 +14,8 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import read_table
-from evlcp_sdk.specs import SpecError, build, shown
-from evlcp_sdk.suggestions import nearest
+from evlcp_sdk.specs import SpecError, build_spec, format_value
+from evlcp_sdk.suggestions import suggest
 
 _MOST_LEDS = 1 << 16
 
@@ -217,10 +217,10 @@ class BarLayout:
         keys = dict(table)
         name = keys.pop("shape", "grid")
         if name not in SHAPES:
-            near = nearest(name, list(SHAPES)) if isinstance(name, str) else ""
-            problem = f" = {shown(name)}: expected one of {', '.join(SHAPES)}{near}"
+            near = suggest(name, list(SHAPES)) if isinstance(name, str) else ""
+            problem = f" = {format_value(name)}: expected one of {', '.join(SHAPES)}{near}"
             raise SpecError([(("shape",), problem)])
-        return cls(build(SHAPES[name], keys)) if table else cls()
+        return cls(build_spec(SHAPES[name], keys)) if table else cls()
 
     @cached_property
     def _leds(self) -> Leds:

@@ -16,8 +16,8 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.specs import SpecError, build, read_toml, toml_value
-from evlcp_sdk.suggestions import nearest
+from evlcp_sdk.specs import SpecError, build_spec, read_toml, to_toml_value
+from evlcp_sdk.suggestions import suggest
 
 _LEAST_UPRIGHT = 0.1
 """Sine of a bar axis' elevation below which the bar counts as lying, so that its LEDs face horizontally."""
@@ -236,10 +236,10 @@ def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSit
     prefix = f"{source}: " if source else ""
     rows = table.get("bar")
     if not isinstance(rows, list) or not rows:
-        lines = [f"{prefix}{key}: unknown table{nearest(key, ['bar'])}" for key in table if key != "bar"]
+        lines = [f"{prefix}{key}: unknown table{suggest(key, ['bar'])}" for key in table if key != "bar"]
         raise ConfigError("\n".join([*lines, f"{prefix}bar: expected one [[bar]] or more"]))
     try:
-        sites = build(_SiteFile, table).bar
+        sites = build_spec(_SiteFile, table).bar
     except SpecError as fault:
         raise ConfigError("\n".join(fault.lines(prefix))) from fault
     faults = []
@@ -262,7 +262,7 @@ def to_toml(sites: Sequence[BarSite]) -> str:
         values = ((f.name, getattr(site, f.name)) for f in fields(site))
         lines += [
             "[[bar]]",
-            *(f"{name} = {toml_value(value)}" for name, value in values if value is not None),
+            *(f"{name} = {to_toml_value(value)}" for name, value in values if value is not None),
             "",
         ]
     return "\n".join(lines)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.blocks import HEADER_BYTES, Kind, Message
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import read_numbers
+from evlcp_sdk.files import read_npy
 from evlcp_sdk.link.compose import beacon_of_site, packets_of
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
@@ -319,7 +319,7 @@ class BarLight:
 
 
 def _read_chips(path: Path, clusters: int) -> NDArray[np.uint8]:
-    chips = read_numbers(path)
+    chips = read_npy(path)
     if chips.ndim != 2 or chips.shape[1] != clusters or not len(chips) or not np.isin(chips, (0, 1)).all():
         raise ConfigError(
             f"{path}: {chips.dtype} {chips.shape}, expected 0 and 1 in an array (chips, {clusters} clusters)"

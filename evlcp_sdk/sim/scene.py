@@ -18,13 +18,13 @@ import numpy as np
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import is_there
+from evlcp_sdk.files import path_exists
 from evlcp_sdk.link.resolve import Link, resolve, with_leds
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.specs import SpecError, build, parse_toml, parse_value, read_toml
-from evlcp_sdk.suggestions import counted, nearest
+from evlcp_sdk.specs import SpecError, build_spec, parse_toml, parse_value, read_toml
+from evlcp_sdk.suggestions import format_count, suggest
 
 MOST_PIXELS = 4096
 """Columns and rows of a sensor."""
@@ -417,7 +417,7 @@ class Scene:
             raise ConfigError(f"bars and lamps: expected at most {MOST_SOURCES} together")
         for i, reflection in enumerate(self.reflections):
             if reflection.bar is not None and reflection.bar >= len(self.bars):
-                some = counted(len(self.bars), "bar")
+                some = format_count(len(self.bars), "bar")
                 raise ConfigError(
                     f"reflections.{i}.bar = {reflection.bar}: expected one of {some}, from 0 on"
                 )
@@ -467,7 +467,7 @@ def preset_text(name: str) -> str:
     """
     known = preset_names()
     if name not in known:
-        raise ConfigError(f"no preset named '{name}'{nearest(name, known)}")
+        raise ConfigError(f"no preset named '{name}'{suggest(name, known)}")
     return (resources.files("evlcp_sdk.sim") / "presets" / f"{name}.toml").read_text(encoding="utf-8")
 
 
@@ -503,9 +503,9 @@ def load_scene(
         path = Path(source)
         folder = path.parent
         where = name
-        if not is_there(path) and not path.suffix:
+        if not path_exists(path) and not path.suffix:
             raise ConfigError(
-                f"{name}: no such file, and no preset of that name{nearest(name, preset_names())}"
+                f"{name}: no such file, and no preset of that name{suggest(name, preset_names())}"
             )
         table = read_toml(path)
     if link is not None:
@@ -547,7 +547,7 @@ def resolve_scene(
         if isinstance(bar, dict) and isinstance(bar.get("link"), _Whole):
             _resolve_link(bar["link"], registry, f"{before}bars.{i}.link")
     try:
-        scene = build(Scene, table, hint=_hint)
+        scene = build_spec(Scene, table, hint=_hint)
     except SpecError as refused:
         raise ConfigError("\n".join(refused.lines(before))) from refused
     except ConfigError as refused:
@@ -712,7 +712,9 @@ def _set(table: dict[str, Any], key: str, value: Any) -> None:
         if len(rest) > 1 and (head, rest[0]) != ("bars", "link"):
             number, *rest = rest
             if not number.isdigit() or int(number) >= len(rows):
-                raise ConfigError(f"--set {key}: expected one of {counted(len(rows), head[:-1])}, from 0 on")
+                raise ConfigError(
+                    f"--set {key}: expected one of {format_count(len(rows), head[:-1])}, from 0 on"
+                )
             holders = [rows[int(number)]]
     for holder in holders:
         if rest[0] == "link" and len(rest) > 1 and head in ("link", "bars"):
@@ -720,7 +722,7 @@ def _set(table: dict[str, Any], key: str, value: Any) -> None:
         elif len(rest) == 1 and head in (key, *_TABLES, *_LISTS):
             holder[rest[0]] = value
         else:
-            raise ConfigError(f"--set {key}: unknown table{nearest(head, [*_TABLES, *_LISTS, 'link'])}")
+            raise ConfigError(f"--set {key}: unknown table{suggest(head, [*_TABLES, *_LISTS, 'link'])}")
 
 
 def _set_link(holder: dict[str, Any], parts: Sequence[str], value: Any, key: str) -> None:

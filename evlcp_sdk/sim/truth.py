@@ -15,7 +15,7 @@ from evlcp_sdk.files import read_json
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite, resolve_sites
-from evlcp_sdk.specs import SpecError, checked
+from evlcp_sdk.specs import SpecError, validate_table
 
 Floats = NDArray[np.float64]
 
@@ -181,7 +181,7 @@ def truth_from_table(
         InputError: It is not a scene's truth, or names codes that are not those of this installation.
     """
     try:
-        found = checked(_TruthTable, table)
+        found = validate_table(_TruthTable, table)
     except SpecError as refused:
         raise InputError(f"{source}: not a scene's truth: {refused.lines()[0].strip()}") from refused
     t_us, n = np.array(found.t_s) * 1e6, len(found.t_s)

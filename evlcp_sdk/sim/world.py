@@ -18,7 +18,7 @@ from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim.motion import CameraPath
 from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec, links_of
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 
 Floats = NDArray[np.float64]
 
@@ -109,9 +109,8 @@ def surveyed_sites(scene: Scene, seed: int, registry: Registry | None = None) ->
     said = []
     for i, (bar, site) in enumerate(zip(scene.bars, true, strict=True)):
         if bar.site_of is not None and bar.site_of >= len(true):
-            raise ConfigError(
-                f"bars.{i}.site_of = {bar.site_of}: expected one of {counted(len(true), 'bar')}, from 0 on"
-            )
+            bars = format_count(len(true), "bar")
+            raise ConfigError(f"bars.{i}.site_of = {bar.site_of}: expected one of {bars}, from 0 on")
         there = true[i if bar.site_of is None else bar.site_of]
         off = np.array(bar.site_off_m) + errors[i]
         place: dict[str, Any] = {}

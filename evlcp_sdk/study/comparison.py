@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from evlcp_sdk.files import defused
+from evlcp_sdk.files import escape_formula
 from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.stopwatch import times_real_time
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, Figure, measure, number_text
@@ -324,7 +324,7 @@ class Comparison:
         writer.writeheader()
         for record in records:
             row = record | {"best": " ".join(record["best"])}
-            writer.writerow({k: defused(v) if isinstance(v, str) else v for k, v in row.items()})
+            writer.writerow({k: escape_formula(v) if isinstance(v, str) else v for k, v in row.items()})
         return out.getvalue()
 
     @property

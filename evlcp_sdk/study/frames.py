@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.files import csv_number, read_csv
+from evlcp_sdk.files import parse_csv_number, read_csv
 from evlcp_sdk.results.folder import check_result_file, read_summary
 from evlcp_sdk.values import Packet
 
@@ -84,7 +84,7 @@ def read_frames(folder: Path | str) -> list[FrameRow]:
 def _row(path: Path, line: int, row: Mapping[str, str | None]) -> FrameRow:
     def number(name: str, *, may_lack: bool = False) -> float:
         text = row.get(name)
-        return math.nan if may_lack and not text else csv_number(path, line, name, text)
+        return math.nan if may_lack and not text else parse_csv_number(path, line, name, text)
 
     def whole(name: str, text: str | None) -> int:
         try:

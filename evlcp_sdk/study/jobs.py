@@ -18,7 +18,7 @@ from importlib import import_module
 from threading import Thread
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, explained
+from evlcp_sdk.errors import ConfigError, EvlcpError, explain_fault
 
 if TYPE_CHECKING:
     from concurrent.futures import Future, ProcessPoolExecutor
@@ -191,7 +191,7 @@ def _attempt(function: Callable[[J], R], job: J) -> Outcome[J, R]:
     try:
         return Outcome(job, function(job))
     except (Exception, SystemExit) as fault:
-        return Outcome(job, fault=Fault(*explained(fault)))
+        return Outcome(job, fault=Fault(*explain_fault(fault)))
 
 
 def _run(

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.specs import SpecError, build, parse_value, read_toml, toml_value
+from evlcp_sdk.specs import SpecError, build_spec, parse_value, read_toml, to_toml_value
 from evlcp_sdk.study.tally import Tally
 
 
@@ -164,7 +164,7 @@ def plan_from_dict(table: Any) -> Plan:
         raise ConfigError("expected a table")
     # What is shown and hashed as it is, is of finite numbers.
     digest_of(table)
-    return build(Plan, table)
+    return build_spec(Plan, table)
 
 
 def digest_of(value: Any) -> str:
@@ -230,7 +230,7 @@ def load_plan(
     for override in overrides:
         _override(table, override)
     try:
-        file = build(_File, table)
+        file = build_spec(_File, table)
     except SpecError as refused:
         raise ConfigError("\n".join(refused.lines(f"{path}: "))) from refused
     folder = Path(path).parent
@@ -306,7 +306,7 @@ def _cases(
         for values in itertools.product(*axes.values()):
             chosen = dict(zip(axes, values, strict=True))
             overrides = [
-                f"{key}={toml_value(_located(value, folder.resolve()) if key.endswith('link') else value)}"
+                f"{key}={to_toml_value(_located(value, folder.resolve()) if key.endswith('link') else value)}"
                 for key, value in (fixed | chosen | variant).items()
             ]
             try:

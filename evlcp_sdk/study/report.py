@@ -26,7 +26,7 @@ from evlcp_sdk.study.summary import (
     verdict_of,
 )
 from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
-from evlcp_sdk.suggestions import counted
+from evlcp_sdk.suggestions import format_count
 
 Dash = Sequence[int]
 
@@ -200,7 +200,7 @@ def page(summary: Summary) -> str:
 def _about(summary: Summary) -> str:
     """How much was done."""
     few = summary.done < summary.tasks
-    done = f"{summary.done} of {summary.tasks} tasks" if few else counted(summary.done, "task")
+    done = f"{summary.done} of {summary.tasks} tasks" if few else format_count(summary.done, "task")
     statistics = [one.statistics for one in summary.series]
     events, seconds = sum(s.events for s in statistics), sum(s.duration_us for s in statistics) * 1e-6
     return f"{done}, {seconds:,.1f} s received, {events / 1e6:,.1f} million events."

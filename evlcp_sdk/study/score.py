@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.formatting import number_or_none
+from evlcp_sdk.formatting import round_or_none
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.link.shared import differences
 from evlcp_sdk.plugin.records import SUMMARY
@@ -64,20 +64,20 @@ def _figures(bar: Statistics, *, road: bool) -> dict[str, Any]:
         "frames_found": tally.frames_found,
         "bit_errors": counted.bit_errors,
         "bits": counted.bits,
-        "ber": number_or_none(counted.ber, 6),
-        "erased": number_or_none(tally.erased_share, 5),
-        "claimed": number_or_none(tally.claimed_share, 5),
-        "rmse_m": number_or_none(tally.rmse_m, 4),
-        "bias_m": number_or_none(tally.bias_m, 4),
-        "worst_m": number_or_none(tally.worst_m, 3),
-        "nees": number_or_none(tally.nees, 2),
+        "ber": round_or_none(counted.ber, 6),
+        "erased": round_or_none(tally.erased_share, 5),
+        "claimed": round_or_none(tally.claimed_share, 5),
+        "rmse_m": round_or_none(tally.rmse_m, 4),
+        "bias_m": round_or_none(tally.bias_m, 4),
+        "worst_m": round_or_none(tally.worst_m, 3),
+        "nees": round_or_none(tally.nees, 2),
         "ranged": tally.ranged,
-        "over_half_metre": number_or_none(tally.gross_share, 4),
+        "over_half_metre": round_or_none(tally.gross_share, 4),
         "segments": {
             f"{start}-{start + SEGMENT_M}m": {
                 "n": tally.ranged,
-                "rmse_m": number_or_none(tally.rmse_m, 4),
-                "bias_m": number_or_none(tally.bias_m, 4),
+                "rmse_m": round_or_none(tally.rmse_m, 4),
+                "bias_m": round_or_none(tally.bias_m, 4),
             }
             for start, tally in bar.segments.items()
             if tally.ranged and 0 <= start < _FARTHEST_M

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Self, overload
 
 from pydantic import Field
 
-from evlcp_sdk.specs import build
+from evlcp_sdk.specs import build_spec
 
 SEGMENT_M = 10
 """Length of the segments of distance that figures are given for, m."""
@@ -413,5 +413,5 @@ class Statistics:
         Raises:
             ConfigError: It is something else.
         """
-        found = build(cls, table)
+        found = build_spec(cls, table)
         return replace(found, segments=dict(sorted(found.segments.items())))

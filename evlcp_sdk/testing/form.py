@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import ROLES
-from evlcp_sdk.specs import spec_model
+from evlcp_sdk.specs import make_model
 from evlcp_sdk.testing.exercises import arguments_of, compile_given, exercise_of
 from evlcp_sdk.testing.law import LawError, Subject, expect, expect_same, law
 from evlcp_sdk.testing.trees import map_arrays
@@ -61,7 +61,7 @@ def _described(subject: Subject) -> None:
 def _round_trip(subject: Subject) -> None:
     _parameters(subject)
     cls = type(subject.algorithm)
-    model = spec_model(cls)
+    model = make_model(cls)
     text = json.dumps(dataclasses.asdict(subject.algorithm), allow_nan=False)
     values = model.model_validate_json(text)
     again = cls(**{name: getattr(values, name) for name in model.model_fields})

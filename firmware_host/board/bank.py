@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.files import read_numbers
+from evlcp_sdk.files import read_npy
 from evlcp_sdk.link.resolve import Link
 from firmware_host.protocol.generated.requests import CLUSTERS, ROW_BYTES, Format
 from firmware_host.protocol.rows import BOARD_LEDS, rows_of_leds
@@ -285,7 +285,7 @@ def read_masks(path: Path, link: Link) -> Bank:
         InputError: The file cannot be read, or holds something else.
     """
     check_rate(link.packet)
-    chips = read_numbers(path)
+    chips = read_npy(path)
     try:
         bank = Bank.of_chips(chips, link.codebook, link.packet, link.bar.led_clusters())
         return replace(bank, rest=link.algorithm("framing").rest())

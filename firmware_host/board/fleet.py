@@ -14,7 +14,7 @@ from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
 from evlcp_sdk.link.compose import messages_of, packets_of, utf8
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.specs import SpecError, build, read_toml, shown
+from evlcp_sdk.specs import SpecError, build_spec, format_value, read_toml
 from firmware_host.board.bank import Bank, bank_of, random_packets, read_masks
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.keys import read_board_key
@@ -138,14 +138,14 @@ def read_entries(path: Path) -> tuple[Entry, ...]:
             and what was expected.
     """
     try:
-        tables = build(_Tables, read_toml(path))
+        tables = build_spec(_Tables, read_toml(path))
     except SpecError as refused:
         raise ConfigError("\n".join(refused.lines(f"{path}: "))) from refused
     entries = []
     for i, row in enumerate(tables.board):
         place = f"{path}: board[{i}]"
         try:
-            entries.append(build(Entry, tables.defaults | row))
+            entries.append(build_spec(Entry, tables.defaults | row))
         except SpecError as refused:
             raise ConfigError("\n".join(refused.lines(f"{place}."))) from refused
         except ConfigError as fault:
@@ -156,7 +156,7 @@ def read_entries(path: Path) -> tuple[Entry, ...]:
             value = getattr(entry, key)
             if value in first and not value.startswith("native:"):
                 raise ConfigError(
-                    f"{path}: board[{i}].{key} = {shown(value)},"
+                    f"{path}: board[{i}].{key} = {format_value(value)},"
                     f" expected another than board[{first[value]}]'s"
                 )
             first[value] = i

@@ -20,9 +20,9 @@ def say(text: str, table: dict[str, Any], as_json: bool) -> None:
 
 def fault_table(fault: BaseException) -> dict[str, Any]:
     """What went wrong, as plain values: kind, exit code, message."""
-    from evlcp_sdk.errors import explained
+    from evlcp_sdk.errors import explain_fault
 
-    message, code = explained(fault)
+    message, code = explain_fault(fault)
     return {"error": {"kind": type(fault).__name__, "exit_code": code, "message": message}}
 
 

@@ -74,7 +74,7 @@ class ContentOptions:
         from time import time as clock_s
 
         from evlcp_sdk.errors import ConfigError
-        from evlcp_sdk.files import read_whole
+        from evlcp_sdk.files import read_bytes
         from evlcp_sdk.link.compose import utf8
         from firmware_host.board.messages import Content, site_that_sends
 
@@ -89,7 +89,7 @@ class ContentOptions:
             utf8(given or "", option)
         site = None if self.beacon is None else site_that_sends(self.beacon, self.transmitter_id, "--id")
         fixed = {
-            "data": None if self.file is None else read_whole(self.file),
+            "data": None if self.file is None else read_bytes(self.file),
             "beacon": site,
             "user": self.user.encode(),
             "key": self.key,

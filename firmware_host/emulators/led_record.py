@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.files import read_whole
+from evlcp_sdk.files import read_bytes
 from firmware_host.protocol.generated.requests import CHIP_DARK, CHIP_TEST, ROW_BYTES
 from firmware_host.protocol.rows import BOARD_LEDS
 
@@ -51,7 +51,7 @@ class LedRecord:
         Raises:
             InputError: It cannot be read, has no whole record, or its chips do not follow one another.
         """
-        data = read_whole(path)
+        data = read_bytes(path)
         whole, cut = divmod(len(data), RECORD.itemsize)
         if not whole:
             raise InputError(

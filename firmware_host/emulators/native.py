@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.files import Outputs, read_whole, writing
+from evlcp_sdk.files import Outputs, read_bytes, writing
 from firmware_host.emulators.listening import HostLine
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.images import check_flash_file
@@ -40,7 +40,7 @@ class NativeBoard:
         if flash is not None:
             check_flash_file(flash)
             if flash.is_file():
-                held = read_whole(flash)
+                held = read_bytes(flash)
                 if len(held) != len(self._held):
                     raise InputError(f"{flash}: not a flash file of {len(self._held)} bytes")
                 self._device.set_flash(held)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.files import open_log, read_whole, writing
+from evlcp_sdk.files import open_log, read_bytes, writing
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.ports.serial_port import SerialTransport
 from firmware_host.ports.usb import device_of
@@ -210,7 +210,7 @@ class ReplayTransport(Transport):
         self._events: deque[tuple[float, str, bytes]] = deque()
         number = 1
         try:
-            head, *lines = read_whole(path).decode("utf-8").splitlines()
+            head, *lines = read_bytes(path).decode("utf-8").splitlines()
             table = json.loads(head)
             self.first, self.nonce, self.baud = int(table["first"]), int(table["nonce"]), int(table["baud"])
             if not (0 <= self.nonce < 1 << 32 and self.baud > 0):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evlcp_sdk.errors import InputError, StreamError
-from evlcp_sdk.files import is_there
+from evlcp_sdk.files import path_exists
 from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ _SUFFIXES = {".aedat4": "faery", ".aedat": "faery", ".dat": "faery", ".es": "fae
 def evlcp_open_events(url: str) -> "EventSource | None":
     """Open a file of one of these formats, by its first bytes or its suffix; or as `bag:` and the like."""
     scheme, colon, rest = url.partition(":")
-    if not colon or is_there(url):
+    if not colon or path_exists(url):
         return _open(url, _format_of(url))
     scheme = scheme.lower()
     if scheme in ("bag", "hdf5"):

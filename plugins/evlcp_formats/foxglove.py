@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.formatting import integrity
+from evlcp_sdk.formatting import integrity_fields
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.results.columns import FRAME_COLUMNS
@@ -20,7 +20,7 @@ from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite
-from evlcp_sdk.utc import at_ns
+from evlcp_sdk.utc import to_utc_ns
 from evlcp_sdk.values import Events, Fix, Packet, Region
 
 FRAME_ID, CAMERA_ID = "enu", "camera"
@@ -136,7 +136,7 @@ class Mcap(Sink):
         from google.protobuf.struct_pb2 import Struct
 
         message = Struct()
-        message.update({"bars": list(fix.transmitters), "refusal": fix.refusal} | integrity(fix))
+        message.update({"bars": list(fix.transmitters), "refusal": fix.refusal} | integrity_fields(fix))
         self._write("/integrity", fix.t_us, message)
 
     def _write_picture(self) -> None:
@@ -212,7 +212,7 @@ class Mcap(Sink):
         self._writer.add_message(self._channels[topic], log_time=log_ns, data=data, publish_time=log_ns)
 
     def _at_ns(self, t_us: float) -> int:
-        return at_ns(self.run.clock_zero, t_us)
+        return to_utc_ns(self.run.clock_zero, t_us)
 
 
 def _schema(name: str) -> Any:

@@ -14,7 +14,7 @@ from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.trail import Trail
-from evlcp_sdk.utc import zero_at
+from evlcp_sdk.utc import clock_zero_at
 from evlcp_sdk.values import Fix
 
 _HEAD = """<?xml version="1.0" encoding="UTF-8"?>
@@ -39,7 +39,7 @@ class Kml(Sink):
         if filtered is None:
             return
         east, north, up = sigmas(fix.covariance_m2)
-        zero = zero_at(self.run.clock_zero, fix.t_us)
+        zero = clock_zero_at(self.run.clock_zero, fix.t_us)
         when = ""
         if zero is not None:
             at = zero.astimezone(UTC) + timedelta(microseconds=round(fix.t_us))

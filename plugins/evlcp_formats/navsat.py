@@ -9,7 +9,7 @@ from evlcp_formats.ros import RosBag
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.utc import at_ns
+from evlcp_sdk.utc import to_utc_ns
 from evlcp_sdk.values import Fix
 
 _NO_FIX, _FIX = -1, 0
@@ -31,7 +31,7 @@ class NavSat(Sink):
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a message."""
-        stamp_ns = at_ns(self.run.clock_zero, fix.t_us)
+        stamp_ns = to_utc_ns(self.run.clock_zero, fix.t_us)
         place, covariance_m2, status, known = (np.nan,) * 3, np.zeros((3, 3)), _NO_FIX, _UNKNOWN
         if filtered is not None:
             place = filtered.latitude_deg, filtered.longitude_deg, filtered.height_m

@@ -16,7 +16,15 @@ from unittest.mock import Mock
 import pytest
 
 from evlcp_sdk.errors import ConfigError, InputError, OutputError
-from evlcp_sdk.files import Outputs, check_columns, defused, open_log, read_csv, read_json, write_secret
+from evlcp_sdk.files import (
+    Outputs,
+    check_columns,
+    escape_formula,
+    open_log,
+    read_csv,
+    read_json,
+    write_secret,
+)
 from evlcp_sdk.specs import read_toml
 
 READERS = read_toml, read_csv, read_json
@@ -177,11 +185,11 @@ def test_a_full_disk_leaves_nothing_half_written_and_no_key_is_overwritten(tmp_p
 
 @pytest.mark.parametrize("text", ["=HYPERLINK(1)", "+1", "-1+2", "@SUM(A1)", "\t=1", "\r=1", "\uff1d1"])
 def test_a_spreadsheet_finds_no_formula(text: str) -> None:
-    assert defused(text) == f"'{text}"
+    assert escape_formula(text) == f"'{text}"
     for harmless in ("night.raw", "", "a=b", "1.5"):
-        assert defused(harmless) == harmless
+        assert escape_formula(harmless) == harmless
     out = io.StringIO()
-    csv.writer(out).writerow([defused(text)])
+    csv.writer(out).writerow([escape_formula(text)])
     assert not re.match(r'"?\s*[=+\-@]', out.getvalue())
 
 

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from evlcp_sdk.kernels import COMPILING, njit
+from evlcp_sdk.kernels import COMPILE_TIMER, njit
 from evlcp_sdk.stopwatch import Stopwatch
-from evlcp_sdk.warming import STEPS, Warmth, warm_up
+from evlcp_sdk.warming import STEPS, WarmUpResult, warm_up
 from tests.conftest import ROOT
 
 OWN = """
@@ -22,7 +22,7 @@ logging.basicConfig(level="INFO", format="%(message)s")
 sys.path.insert(0, sys.argv[1])
 import own_kernels
 from evlcp_sdk import kernels
-kernels.COMPILING._said_at_s = 0.0
+kernels.COMPILE_TIMER._report_at_s = 0.0
 print(own_kernels.twice(21), kernels.count_imported(), kernels.count_compiled())
 print(kernels.find_cache_folder())
 """
@@ -100,8 +100,8 @@ def busy(seconds: float) -> None:
 
 def test_time_for_kernels_is_left_out() -> None:
     watch, stats = Stopwatch(), SimpleNamespace(cache_misses={})
-    inner = COMPILING.watched(SimpleNamespace(compile=lambda _: busy(0.05), stats=stats))
-    outer = COMPILING.watched(SimpleNamespace(compile=lambda sig: (busy(0.05), inner(sig)), stats=stats))
+    inner = COMPILE_TIMER.watch(SimpleNamespace(compile=lambda _: busy(0.05), stats=stats))
+    outer = COMPILE_TIMER.watch(SimpleNamespace(compile=lambda sig: (busy(0.05), inner(sig)), stats=stats))
     with watch.running():
         began_s = time.perf_counter()
         outer(None)
@@ -124,11 +124,11 @@ def test_a_warm_up_leaves_nothing_to_compile() -> None:
 @pytest.mark.parametrize(
     ("warmth", "words"),
     [
-        (Warmth(0, 2.5, None), "nothing to compile; tried in 2.5 s"),
-        (Warmth(7, 31.0, None), "7 kernels compiled in 31 s they cannot be kept"),
+        (WarmUpResult(0, 2.5, None), "nothing to compile; tried in 2.5 s"),
+        (WarmUpResult(7, 31.0, None), "7 kernels compiled in 31 s they cannot be kept"),
     ],
 )
-def test_the_command_says_what_it_did(evlcp, monkeypatch, warmth: Warmth, words: str) -> None:
+def test_the_command_says_what_it_did(evlcp, monkeypatch, warmth: WarmUpResult, words: str) -> None:
     monkeypatch.setattr("evlcp_sdk.warming.warm_up", lambda advance: [advance(s) for s in STEPS] and warmth)
     done = evlcp("warm-up")
     assert done.code == 0

@@ -7,7 +7,7 @@ import pytest
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.specs import SpecError, build, parse_toml, parse_value
+from evlcp_sdk.specs import SpecError, build_spec, parse_toml, parse_value
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Outer:
 )
 def test_a_fault_is_one_line_with_path_value_and_what_was_expected(table, says) -> None:
     with pytest.raises(SpecError) as caught:
-        build(Outer, {"count": 1} | table if table else {})
+        build_spec(Outer, {"count": 1} | table if table else {})
     (line,) = caught.value.lines("f.toml: ")
     assert line.startswith(f"f.toml: {says}")
     assert caught.value.exit_code == 2
@@ -52,9 +52,9 @@ def test_a_fault_is_one_line_with_path_value_and_what_was_expected(table, says) 
 
 def test_what_the_dataclass_refuses_passes_and_a_hint_stands_for_the_nearest() -> None:
     with pytest.raises(ConfigError, match=r"^count = 13: expected another"):
-        build(Outer, {"count": 13})
+        build_spec(Outer, {"count": 13})
     with pytest.raises(SpecError, match=r"^rows\.0\.wide = 3: unknown key; see width$"):
-        build(Outer, {"count": 1, "rows": [{"wide": 3}]}, hint=lambda path: f"; see {path[-1][:3]}th")
+        build_spec(Outer, {"count": 1, "rows": [{"wide": 3}]}, hint=lambda path: f"; see {path[-1][:3]}th")
 
 
 @pytest.mark.parametrize("digits", ["9" * 5000, "0x" + "f" * 5000, "9223372036854775808"])
@@ -64,7 +64,7 @@ def test_an_integer_beyond_64_bits_is_a_line(digits: str) -> None:
             parse_toml(text, "here")
     assert parse_value(digits) == digits
     with pytest.raises(SpecError) as caught:
-        build(Outer, {"count": parse_value(digits)})
+        build_spec(Outer, {"count": parse_value(digits)})
     (line,) = caught.value.lines()
     assert len(line) < 250
     assert line.endswith(": expected a valid integer")

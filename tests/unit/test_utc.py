@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.utc import PulseClock, at_ns, zero_at
+from evlcp_sdk.utc import PulseClock, clock_zero_at, to_utc_ns
 from evlcp_sdk.values import Triggers
 
 BEGIN = datetime(2026, 3, 1, 12, 0, 0, tzinfo=UTC)
@@ -39,14 +39,14 @@ def test_utc_is_that_of_the_pulses(ppm: float, near_s: float) -> None:
     assert clock.rate_ppm == pytest.approx(ppm, abs=2.1)
     for second in (1.5, 2.99, 3.0, 4.7, 5.0, 5.9, 9.0):
         t_us = camera_us(second, ppm)
-        zero = zero_at(clock, t_us)
+        zero = clock_zero_at(clock, t_us)
         assert zero is not None
         told_s = (zero + timedelta(microseconds=t_us) - BEGIN).total_seconds()
         # Times of pulses are whole us: so is the rate's doubt, and it grows behind the last one.
         assert told_s == pytest.approx(second, abs=2e-6 * (1 + max(second - 5, 1.0)))
-        assert at_ns(clock, t_us) / 1e9 - BEGIN.timestamp() == pytest.approx(told_s, abs=1.1e-6)
+        assert to_utc_ns(clock, t_us) / 1e9 - BEGIN.timestamp() == pytest.approx(told_s, abs=1.1e-6)
     # Before the first pulse, what is known beforehand.
-    early = zero_at(clock, 0.0)
+    early = clock_zero_at(clock, 0.0)
     assert early is not None
     assert abs((early - near).total_seconds()) < 1e-6
 
@@ -76,8 +76,8 @@ def test_strays_are_left_out_and_counted_and_a_leap_is_believed() -> None:
 
 def test_the_computers_clock_says_which_second_it_is() -> None:
     clock = PulseClock()
-    assert zero_at(clock, 0.0) is None
-    assert at_ns(clock, 5.0) == 5000
+    assert clock_zero_at(clock, 0.0) is None
+    assert to_utc_ns(clock, 5.0) == 5000
     # What came last was at 10.7 s, and just now: 0.2 s late.
     clock.add(edges([10_000_000.0]), BEGIN.timestamp() + 0.9, 10_700_000.0)
     assert clock.utc_s(10_000_000) == BEGIN.timestamp()

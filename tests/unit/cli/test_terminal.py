@@ -18,7 +18,7 @@ from rich.console import Console
 from evlcp_sdk.cli._common import log_on_stderr
 from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.io import write_events
-from evlcp_sdk.printable import printable
+from evlcp_sdk.printable import escape_controls
 from evlcp_sdk.values import Events
 
 TITLE = "\x1b]0;mine\x07\x9b31m\u202e"
@@ -47,9 +47,9 @@ def on_a_terminal(*arguments: str) -> str:
 
 
 def test_control_characters_are_escapes_and_the_rest_is_as_it_is() -> None:
-    assert printable("a\tb\nä 光 [bold]") == "a\tb\nä 光 [bold]"
-    assert printable(TITLE) == r"\x1b]0;mine\x07\x9b31m\u202e"
-    assert printable("\udcff\r\x7f") == r"\udcff\x0d\x7f"
+    assert escape_controls("a\tb\nä 光 [bold]") == "a\tb\nä 光 [bold]"
+    assert escape_controls(TITLE) == r"\x1b]0;mine\x07\x9b31m\u202e"
+    assert escape_controls("\udcff\r\x7f") == r"\udcff\x0d\x7f"
 
 
 @pytest.mark.parametrize("what", ["receive", "missing", "option", "config"])

@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 from rx_streams import LINK, frames_of, received
 
-from evlcp_sdk.files import shipped
+from evlcp_sdk.files import find_shipped_file
 from evlcp_sdk.io import read_events
 from evlcp_sdk.rx.placement import layout_of, placements
 from evlcp_sdk.rx.points import points_finder
@@ -149,7 +149,9 @@ def test_points_of_a_turning_camera_lie_where_they_are():
 
 def test_sigma_is_the_scatter_about_the_similarity():
     squares, freedom = 0.0, 0
-    for frame in frames_of(received(LINK, read_events(shipped("recordings", "night-50m-30kmh-cut.raw")))[1]):
+    for frame in frames_of(
+        received(LINK, read_events(find_shipped_file("recordings", "night-50m-30kmh-cut.raw")))[1]
+    ):
         seen = np.isfinite(frame.points_px[:, 0])
         z, c = (one[seen] @ [1, 1j] for one in (frame.points_px, CENTRES))
         w = 1 / frame.points_sigma_px[seen]

@@ -7,7 +7,7 @@ import pytest
 from rx_streams import LINK, frames_of, received
 
 import evlcp_sdk as evlcp
-from evlcp_sdk.files import shipped
+from evlcp_sdk.files import find_shipped_file
 from evlcp_sdk.io import read_events
 from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.sim import load_scene
@@ -29,7 +29,7 @@ def figures(packets):
 
 
 def recording():
-    return read_events(shipped("recordings", "night-50m-30kmh-cut.raw"))
+    return read_events(find_shipped_file("recordings", "night-50m-30kmh-cut.raw"))
 
 
 def simulated(scene, **overrides):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rx_streams import LINK, frames_of, lit, noise_events, received, said
 
-from evlcp_sdk.files import shipped
+from evlcp_sdk.files import find_shipped_file
 from evlcp_sdk.io import read_events
 from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.rx.limits import Limits
@@ -38,7 +38,7 @@ def few_pilots():
 
 
 def recording():
-    return read_events(shipped("recordings", "night-50m-30kmh-cut.raw"))
+    return read_events(find_shipped_file("recordings", "night-50m-30kmh-cut.raw"))
 
 
 def growing_together():

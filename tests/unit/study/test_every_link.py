@@ -16,7 +16,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Modulation
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, load_scene, truth_of
-from evlcp_sdk.specs import toml_value
+from evlcp_sdk.specs import to_toml_value
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.study.tally import Tally
@@ -62,7 +62,7 @@ SEED = 2
 
 
 def options(settings: Settings, before: str = "") -> list[str]:
-    return [part for k, v in settings.items() for part in ("--set", f"{before}{k}={toml_value(v)}")]
+    return [part for k, v in settings.items() for part in ("--set", f"{before}{k}={to_toml_value(v)}")]
 
 
 def run(evlcp, *args: str | Path) -> str:
@@ -93,7 +93,8 @@ def test_all_commands_agree(name: str, evlcp, tmp_path: Path) -> None:
     told = json.loads(run(evlcp, "compare", raw, "--variant", "it:", *options(link), "--json"))
     (row,) = told["rows"]
     in_scene, in_link = (
-        "".join(f"set.{key} = {toml_value(value)}\n" for key, value in some.items()) for some in (scene, link)
+        "".join(f"set.{key} = {to_toml_value(value)}\n" for key, value in some.items())
+        for some in (scene, link)
     )
     (tmp_path / "c.toml").write_text(
         f'[campaign]\nname = "one"\nfirst_seed = {SEED}\n[scene]\nbase = "drive-30kmh"\n{in_scene}'
