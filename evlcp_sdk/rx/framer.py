@@ -1,4 +1,4 @@
-"""What a framer is, which finds packets in regions and reads them, and what it is told of the stream."""
+"""What a framer is, which turns the events of regions into frames, and the context of its stream."""
 
 import math
 import time
@@ -17,29 +17,32 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Frame, Region, SyncLock, replace_fields
 
-_MOST_LIT = 1024
-"""Transmitters that are remembered: those seen last."""
+_MAX_REMEMBERED = 1024
+"""Transmitters that are remembered, those seen last."""
 
 
-def note_lit(lit: dict[int, tuple[float, float]], number: int, first_us: float, start_us: float) -> None:
-    """Remember of a transmitter its first and its last frame in which its light was there.
+def record_light(
+    spans_us: dict[int, tuple[float, float]], number: int, first_us: float, start_us: float
+) -> None:
+    """Record the start of a frame in which a transmitter's light was there.
 
-    `lit` are their starts by number, camera clock, us; `first_us` is the first one's if it is new there.
+    `spans_us` are starts of the first and the last such frame by number, camera clock, us; `first_us` is the
+    first one's if the transmitter is new there.
 
-    >>> lit = {}
-    >>> note_lit(lit, 3, 500.0, 500.0)
-    >>> note_lit(lit, 3, 500.0, 3700.0)
-    >>> lit
+    >>> spans_us = {}
+    >>> record_light(spans_us, 3, 500.0, 500.0)
+    >>> record_light(spans_us, 3, 500.0, 3700.0)
+    >>> spans_us
     {3: (500.0, 3700.0)}
     """
-    first_us, _ = lit.pop(number, (first_us, start_us))
-    lit[number] = (first_us, start_us)
-    if len(lit) > _MOST_LIT:
-        del lit[next(iter(lit))]
+    first_us, _ = spans_us.pop(number, (first_us, start_us))
+    spans_us[number] = (first_us, start_us)
+    if len(spans_us) > _MAX_REMEMBERED:
+        del spans_us[next(iter(spans_us))]
 
 
-def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
-    """What a stage gives, with the times of the camera's clock."""
+def to_camera_time(value: Any, camera_us: Callable[[float], float]) -> Any:
+    """A stage's value with its times on the camera's clock."""
     match value:
         case Region():
             return replace_fields(value, t_us=camera_us(value.t_us))
@@ -49,29 +52,29 @@ def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
 
 
 class Announcer:
-    """Says of each finished stage what it gave, in times of the camera's clock, and how long it took."""
+    """Announces what each finished stage gave, on the camera's clock, and how long it took."""
 
     def __init__(self, hook: Callable[..., Any], camera_us: Callable[[float], float]) -> None:
         self._hook, self._camera_us = hook, camera_us
-        self.start()
+        self.start_clock()
 
-    def start(self) -> None:
-        """Start the clock."""
+    def start_clock(self) -> None:
+        """Start the clock of a frame."""
         self._start_s = self._lap_s = time.perf_counter()
 
-    def lap(self, stage: str, value: object) -> None:
-        """Announce what took the time since the last lap."""
+    def announce(self, stage: str, value: object) -> None:
+        """Announce what took the time since the last announcement."""
         now = time.perf_counter()
         elapsed_s, self._lap_s = now - self._lap_s, now
-        self._say(stage, value, elapsed_s)
+        self._call_hook(stage, value, elapsed_s)
 
-    def frame(self, frame: Frame) -> None:
-        """Announce a frame, which took all laps since the start together."""
-        self._say("frame", frame, self._lap_s - self._start_s)
+    def announce_frame(self, frame: Frame) -> None:
+        """Announce a frame, which took all the time since the start."""
+        self._call_hook("frame", frame, self._lap_s - self._start_s)
 
-    def _say(self, stage: str, value: object, elapsed_s: float) -> None:
+    def _call_hook(self, stage: str, value: object, elapsed_s: float) -> None:
         try:
-            self._hook(stage=stage, value=on_camera(value, self._camera_us), elapsed_s=elapsed_s)
+            self._hook(stage=stage, value=to_camera_time(value, self._camera_us), elapsed_s=elapsed_s)
         except EvlcpError:
             raise
         except (Exception, SystemExit) as fault:
@@ -84,12 +87,12 @@ class StreamContext:
 
     Attributes:
         clock: Its clock.
-        attitude_at: What is known of the camera's attitude at a time.
+        attitude_at: The camera's attitude at a time, as far as it is known.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
         announcer: Announces finished stages; None where nobody listens.
-        limits: How much each link holds at the most.
+        limits: How much each link holds at most.
         numbers: Where the numbers of transmitters come from.
-        bars: Decoders of a link's known bars, by its name, see `reading.Bars`; None for this process.
+        bar_decoders: The `BarDecoder`s of a link, by its name; None for those of this process.
     """
 
     clock: CameraClock
@@ -98,38 +101,38 @@ class StreamContext:
     announcer: Announcer | None = None
     limits: Limits = LIMITS
     numbers: Iterator[int] = field(default_factory=count)
-    bars: Callable[[str], Sequence[Any]] | None = None
+    bar_decoders: Callable[[str], Sequence[Any]] | None = None
 
 
 class Framer(ABC):
-    """The events of regions to frames, time step by time step.
+    """Turns the events of regions into frames, time step by time step.
 
     Attributes:
         counts: What was found and dropped so far.
-        lit: When the light of its transmitters was there: see `note_lit`.
+        light_spans_us: When the light of its transmitters was there, see `record_light`.
         ranging_every: See `Receiver`.
         due_us: When the next frame can be decoded, us; infinite where that waits for the end of a time step.
         patience_us: How late a frame may be given, us.
-        cut_by_the_end: Frames whose late events the stream's end cuts off are not given.
+        drops_cut_frames: Frames whose late events the stream's end cuts off are not given.
     """
 
-    cut_by_the_end: ClassVar[bool]
+    drops_cut_frames: ClassVar[bool]
     counts: dict[str, int]
-    lit: dict[int, tuple[float, float]]
+    light_spans_us: dict[int, tuple[float, float]]
     ranging_every: int
     due_us: float = math.inf
     patience_us: float
 
     @abstractmethod
     def step(self, regions: list[Followed], step: TimeStep) -> None:
-        """Receive and decode what the regions of a time step send."""
+        """Decode what the regions of a time step send."""
 
-    def catch_up(self, start_us: int) -> None:
+    def apply_pending(self, start_us: int) -> None:
         """Apply what was decoded some time steps before, at the start of a time step, us."""
         return
 
-    def ahead(self, step: TimeStep) -> None:
-        """Decode the frames that are due in the part so far of a time step, if there can be any."""
+    def decode_early(self, step: TimeStep) -> None:
+        """Decode the frames that are due in the part of a time step that is there so far, if any can be."""
         return
 
     @abstractmethod
@@ -137,14 +140,14 @@ class Framer(ABC):
         """Number of a region's transmitter; None before its first frame."""
 
     @abstractmethod
-    def let_go(self, region: Followed) -> None:
-        """Forget a region that is no more followed, as its place is another's."""
+    def forget_region(self, region: Followed) -> None:
+        """Forget a region that is no longer followed, as its place is another's."""
 
-    def discard(self, *, place: Region | None = None, number: int | None = None) -> int:
-        """Count no frame that was not read where another link's packet was; return how many they were.
+    def discard_misses(self, *, place: Region | None = None, number: int | None = None) -> int:
+        """Discard the misses counted where another link's packet was; return how many.
 
         Args:
-            place: The packet's place; None for that of the transmitter that is another link's.
+            place: The packet's place; None for those of a transmitter that belongs to another link.
             number: Its number.
         """
         return 0

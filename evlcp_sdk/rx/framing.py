@@ -1,4 +1,4 @@
-"""The built-in framing: packets of a preamble and frames, from the events of regions to frames."""
+"""The built-in framing: packets of a preamble and frames, decoded from the events of regions."""
 
 import math
 from collections import Counter, deque
@@ -13,9 +13,9 @@ from evlcp_sdk.clock import TimeStep
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Synchronizer
 from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame
-from evlcp_sdk.rx.framer import Framer, StreamContext, note_lit
+from evlcp_sdk.rx.framer import Framer, StreamContext, record_light
 from evlcp_sdk.rx.guard import Guard, compiled
-from evlcp_sdk.rx.reading import BarDecoder, Bars, FrameDecoder, FrameJob, FrameResult
+from evlcp_sdk.rx.reading import BarDecoder, FrameDecoder, FrameJob, FrameResult, LocalBarDecoder
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
 from evlcp_sdk.rx.regions import (
     MARGIN_PX,
@@ -27,32 +27,38 @@ from evlcp_sdk.rx.regions import (
     ShownPlace,
     same_place,
 )
-from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters, measure_row_delay, retime
+from evlcp_sdk.rx.transmitters import (
+    LOOKBACK_PACKETS,
+    Transmitter,
+    Transmitters,
+    measure_row_delay,
+    retime_lock,
+)
 from evlcp_sdk.values import Events, Frame, Region, SyncLock, replace_fields
 
 _TAIL_CHIPS = 0.5
-"""A frame is whole if the stream goes on for this long after its last edge's events: some come later."""
+"""A frame is complete once the stream goes on for this long after its last edge: some events come late."""
 
-_APPLIED_STEPS = 2
-"""Steps after which a frame of a bar that is followed well sets its region right, counts and is given,
-whoever decodes it: the next one of its bar is due by then, and more would only make it later."""
+_APPLY_AFTER_STEPS = 2
+"""Steps after which a frame of a steadily followed bar corrects its region, counts and is published, whoever
+decodes it: the next frame of its bar is due by then, and more steps would only delay it."""
 
-_MOST_OLD = 2
-"""Frames decoded in a step beyond those that end in one: all that came before a first lock would take as long
-as ten steps, and other transmitters would wait."""
+_MAX_OVERDUE = 2
+"""Overdue frames decoded in a step, beyond those that end in it: all frames before a first lock would take as
+long as ten steps, and other transmitters would wait."""
 
-_LOOKS = 3
-"""Looks at a region's first frame: at what was found of a bar, at the whole of it, and once more, as few
-clusters place it less well than all. Looks at another one whose region had strayed, too."""
+_MAX_ALIGNMENTS = 3
+"""Alignments of a frame while its region is off: for a first frame by what was found of the bar, by all of
+it, and once more, as few clusters place a bar less well than all."""
 
-_DIMMED = 1.5
-"""Events of a step with a preamble, over those of another, from which on it is looked when in a chip these
-come: a bar's data alone change them by a third at the most."""
+_DIMMED_RATIO = 1.5
+"""Events of the step with a preamble, over those of another, from which on frames are timed anew: a bar's
+data alone change them by a third at most."""
 
-_DARK = 0.25
-"""Share of a pilot's events below which a bar that was seen before is out of sight, or hidden."""
+_DARK_SHARE = 0.25
+"""Share of a pilot's events below which a known bar is hidden or out of sight."""
 
-_MOST_ENDED, _PART_PX = 64, 16.0
+_MAX_ENDED, _PART_MARGIN_PX = 64, 16.0
 """Regions that ended without a frame that are remembered, and how far outside of a bar they may have been
 parts of it: pieces of a near bar are followed before the whole of it is known, and the image moves."""
 
@@ -76,19 +82,19 @@ _COUNTS = (
 
 
 class Skipped(StrEnum):
-    """Why a frame that was due is not given; its value is the count that it belongs to."""
+    """Why a frame that was due is skipped; the value is the count that it belongs to."""
 
     DARK = "frames_dark"
-    """A bar that was seen before has few events by now."""
+    """A known bar has too few events."""
     REJECTED = "frames_rejected"
-    """It does not show its clusters where the bar has them."""
+    """Its clusters are not where the bar has them."""
     UNREAD = "frames_unread"
-    """It shows them, and no symbol that is sure."""
+    """It has clusters, and no symbol that is sure."""
 
 
 @dataclass(frozen=True)
 class SkippedFrame:
-    """A frame that was due and is not given: what the stage `skipped` announces.
+    """A frame that was due and is skipped: what the stage `skipped` announces.
 
     Attributes:
         transmitter: Number of the transmitter; None before its first frame.
@@ -96,7 +102,7 @@ class SkippedFrame:
         frame: Number of the frame in its packet.
         t_us: Start of its first chip on the camera's clock, us.
         why: The count that it belongs to, such as `frames_dark`.
-        link: Name of the link, of a receiver of several.
+        link: Name of the link, in a receiver of several.
     """
 
     transmitter: int | None
@@ -109,34 +115,36 @@ class SkippedFrame:
 
 @dataclass(frozen=True, eq=False)
 class PendingFrame:
-    """A frame that is decoded by itself, and not applied.
+    """A frame that was submitted for decoding, and is not applied yet.
 
     Attributes:
         transmitter: Whose it is.
         due: Which frame.
         step_us: Start of the time step in which it was due, us.
         ranged: Its distance is measured.
-        answer: Gives what it says, once that is known; None where it is to be decoded again, here.
-        frame: The same for those who listen, if it was told already.
+        fetch_result: Returns what was decoded, once that is known; None where the frame is to be decoded
+            again, here.
+        frame: The same as published, if it was already.
     """
 
     transmitter: Transmitter
     due: DueFrame
     step_us: int
     ranged: bool
-    answer: Callable[[], FrameResult | None]
+    fetch_result: Callable[[], FrameResult | None]
     frame: Frame | None
 
 
 class PacketFraming(Framer):
-    """Finds the packets of the regions of a stream, decodes their frames, and sets the regions right by them.
+    """Finds the packets of a stream's regions, decodes their frames, and corrects the regions by them.
 
-    The `follower` is the same as the regions where frames correct them; None where they stay as a detector
-    has them. Decoded frames go to the `queue`. Frames of a bar that its region follows well are decoded by
-    themselves, and applied a fixed number of time steps later: so it is all the same who decodes them.
+    `follower` is `regions` again where frames correct them; None where they stay as a detector has them.
+    Decoded frames go to the `queue`. Frames of a bar that its region follows steadily are decoded by
+    themselves, and applied a fixed number of time steps later, so that the result is the same whoever decodes
+    them.
     """
 
-    cut_by_the_end = True
+    drops_cut_frames = True
 
     def __init__(
         self,
@@ -160,7 +168,9 @@ class PacketFraming(Framer):
             link, "synchronization", link.codebook, link.packet, methods=("init", "step")
         )
         self._decoder, self._aligner = decoder, decoder.aligner
-        self._bars: Sequence[Bars] = [BarDecoder(decoder)] if stream.bars is None else stream.bars(name)
+        self._bar_decoders: Sequence[BarDecoder] = (
+            [LocalBarDecoder(decoder)] if stream.bar_decoders is None else stream.bar_decoders(name)
+        )
         self._pending: deque[PendingFrame] = deque()
         self._regions, self._follower = regions, follower
         self._name = name
@@ -170,126 +180,125 @@ class PacketFraming(Framer):
         self._preamble = 2 * link.codebook.preamble.astype(np.float64) - 1
         self._reflections = queue.reflections
         self._queue = queue
-        self._joined: set[int] = set()
-        # Number, place and what was missed.
-        self._ended: deque[tuple[int | None, tuple[float, float], Counter[str]]] = deque(maxlen=_MOST_ENDED)
+        self._dropped: set[int] = set()
+        # Number, place and misses.
+        self._ended: deque[tuple[int | None, tuple[float, float], Counter[str]]] = deque(maxlen=_MAX_ENDED)
         self._due: deque[Followed] = deque()
         # Frames that end in one step, and how long it takes to decode those before a first lock.
         per_step = self._step_us / (link.packet.info_chips * link.packet.chip_us)
-        self._most_due = math.ceil(per_step) + _MOST_OLD
-        caught_up = math.ceil(LOOKBACK_PACKETS * link.packet.frames / (self._most_due - per_step))
+        self._max_due = math.ceil(per_step) + _MAX_OVERDUE
+        caught_up = math.ceil(LOOKBACK_PACKETS * link.packet.frames / (self._max_due - per_step))
         packets_us = LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us
-        self.patience_us = packets_us + (caught_up + _APPLIED_STEPS) * self._step_us
+        self.patience_us = packets_us + (caught_up + _APPLY_AFTER_STEPS) * self._step_us
         self.counts = dict.fromkeys(_COUNTS, 0)
-        self.lit: dict[int, tuple[float, float]] = {}
+        self.light_spans_us: dict[int, tuple[float, float]] = {}
         self.ranging_every = 1
-        self._measurable = 0
+        self._pilot_frames = 0
         self._now_us = 0
 
-    def catch_up(self, start_us: int) -> None:
-        """Apply the frames whose time it is at the start of a time step."""
+    def apply_pending(self, start_us: int) -> None:
+        """Apply the decoded frames that are due to be applied at the start of a time step."""
         self._now_us = start_us
-        self._joined.clear()
-        while self._pending and self._pending[0].step_us + _APPLIED_STEPS * self._step_us <= start_us:
-            self._apply(self._pending.popleft())
+        self._dropped.clear()
+        while self._pending and self._pending[0].step_us + _APPLY_AFTER_STEPS * self._step_us <= start_us:
+            self._apply_frame(self._pending.popleft())
 
     def step(self, regions: list[Followed], step: TimeStep) -> None:
-        """Receive and decode what the regions of a time step send."""
-        self._joined.clear()
-        # A frame may show another image of its bar: that is a region, too, and received at once.
+        """Synchronize with the regions of a time step and decode their frames."""
+        self._dropped.clear()
+        # A frame may show another image of its bar: that is a region, too, and decoded at once.
         self._due = deque(regions)
         while self._due:
             region = self._due.popleft()
-            if region.id in self._joined:
+            if region.id in self._dropped:
                 continue
-            transmitter = self._hear(region, step)
+            transmitter = self._synchronize(region, step)
             until_us = step.end_us - self._tail_us
-            self._decode_due(transmitter, until_us, self._most_due)
-            transmitter.behind = transmitter.grid.due(until_us) is not None
-            if region.id in self._joined:
+            self._decode_due(transmitter, until_us, self._max_due)
+            transmitter.is_behind = transmitter.grid.next_due(until_us) is not None
+            if region.id in self._dropped:
                 continue
-            waiting = self._waiting(transmitter)
-            due = waiting[0].due if waiting else transmitter.grid.next
-            self._transmitters.forget(transmitter, due, step.end_us)
+            pending = self._pending_of(transmitter)
+            due = pending[0].due if pending else transmitter.grid.next
+            self._transmitters.drop_old_events(transmitter, due, step.end_us)
             if region.released:
-                self._end(transmitter, step.end_us)
+                self._end_transmitter(transmitter, step.end_us)
                 # Its last frames may have shown that it is a part of another.
-                if region.id not in self._joined:
+                if region.id not in self._dropped:
                     self.counts["regions_released"] += 1
                     self._transmitters.release(transmitter)
-        self._find_due()
+        self._update_due_time()
 
-    def _find_due(self) -> None:
-        """Find out when the next frame is due whose region is set right by its frames."""
+    def _update_due_time(self) -> None:
         due_us = math.inf
-        for one in self._transmitters.alive.values() if self._follower is not None else ():
-            due = one.grid.next
-            if due is not None and due.read_us < due_us and _in_time(one):
+        for transmitter in self._transmitters.alive.values() if self._follower is not None else ():
+            due = transmitter.grid.next
+            if due is not None and due.read_us < due_us and _can_decode_early(transmitter):
                 due_us = due.read_us
         self.due_us = due_us + self._tail_us
 
-    def ahead(self, step: TimeStep) -> None:
-        """Decode the frames that are due in the part so far of a time step."""
+    def decode_early(self, step: TimeStep) -> None:
+        """Decode the frames that are due in the part of a time step that is there so far."""
         if self._follower is None:
             return
-        self.catch_up(step.start_us)
+        self.apply_pending(step.start_us)
         self._due.clear()
         until_us = step.end_us - self._tail_us
         alive = self._transmitters.alive.values()
-        due = [one for one in alive if one.grid.due(until_us) is not None and _in_time(one)]
-        meant = {one.region.id for one in due}
-        self._follower.begin_part(step.start_us, step.end_us, step.events, meant)
+        due = [one for one in alive if one.grid.next_due(until_us) is not None and _can_decode_early(one)]
+        region_ids = {one.region.id for one in due}
+        self._follower.begin_part(step.start_us, step.end_us, step.events, region_ids)
         for transmitter in due:
-            self._decode_ahead(transmitter, until_us)
+            self._decode_early(transmitter, until_us)
         self._follower.end_part(step.end_us)
-        self._find_due()
+        self._update_due_time()
 
     def number_of(self, region: Followed) -> int | None:
         """Number of a region's transmitter; None before its first frame."""
         transmitter = self._transmitters.alive.get(region.id)
         return None if transmitter is None else transmitter.number
 
-    def discard(self, *, place: Region | None = None, number: int | None = None) -> int:
-        """Take frames missed where another link's packet was, or of a number, out of the counts; how many."""
+    def discard_misses(self, *, place: Region | None = None, number: int | None = None) -> int:
+        """Discard the misses counted where another link's packet was, or for a number; return how many."""
         missed: Counter[str] = Counter()
         for one in self._transmitters.alive.values():
             if one.number == number if place is None else same_place(one.region.latest, place):
                 missed, one.missed = missed + one.missed, Counter()
         for ended in list(self._ended):
-            known, (x, y), its = ended
-            if place is not None and known is None:
-                found = same_place(replace_fields(place, x_px=x, y_px=y), place)
+            ended_number, (x, y), ended_missed = ended
+            if place is not None and ended_number is None:
+                matches = same_place(replace_fields(place, x_px=x, y_px=y), place)
             else:
-                found = place is None and known == number
-            if found:
+                matches = place is None and ended_number == number
+            if matches:
                 self._ended.remove(ended)
-                missed += its
-        return self._discarded(missed)
+                missed += ended_missed
+        return self._uncount(missed)
 
-    def _discarded(self, missed: Counter[str]) -> int:
-        for name, many in missed.items():
-            self.counts[name] -= many
+    def _uncount(self, missed: Counter[str]) -> int:
+        for name, count in missed.items():
+            self.counts[name] -= count
         return missed.total()
 
     def close(self) -> None:
         """End the stream: decode what the regions still show."""
         for transmitter in self._transmitters.close():
-            self._end(transmitter, self._clock.last_us)
+            self._end_transmitter(transmitter, self._clock.last_us)
 
-    def _hear(self, region: Followed, step: TimeStep) -> Transmitter:
-        """Listen to a region's events of a time step, or to all that it has if it is new."""
+    def _synchronize(self, region: Followed, step: TimeStep) -> Transmitter:
+        """Synchronize with a region's events of a time step, or with all that it has if it is new."""
         transmitter, guard = self._transmitters.alive.get(region.id), self._sync_guard
         pieces: Iterable[tuple[int, Events]] = region.pieces if transmitter is None else (region.pieces[-1],)
         if transmitter is None:
             self.counts["regions_opened"] += 1
             with guard:
                 state = self._synchronizer.init()
-            transmitter = self._transmitters.open(region, state, self._decoder.first_state())
+            transmitter = self._transmitters.open(region, state, self._decoder.init_state())
         for start_us, events in pieces:
             self.counts["events_in_regions"] += events.t_us.size
             until_us = min(start_us + self._step_us, step.end_us)
             if self._announcer is not None:
-                self._announcer.start()
+                self._announcer.start_clock()
             try:
                 transmitter.sync, locks = self._synchronizer.step(
                     transmitter.sync, events.t_us, events.p, until_us
@@ -299,82 +308,84 @@ class PacketFraming(Framer):
                 raise
             if guard.checks:
                 guard.expect_locks(locks, until_us, self._packet)
-            for heard in locks:
+            for lock in locks:
                 if self._announcer is not None:
-                    self._announcer.lap("synchronization", heard)
+                    self._announcer.announce("synchronization", lock)
                 self.counts["preambles"] += 1
-                lock = self._late_rows(transmitter, heard)
+                lock = self._correct_row_delay(transmitter, lock)
                 transmitter.step_events = events.t_us.size
-                if transmitter.grid.follow(lock):
-                    transmitter.settle()
+                if transmitter.grid.accept_lock(lock):
+                    transmitter.confirm_frames()
                     continue
                 self.counts["locks"] += 1
                 if transmitter.number is not None:
-                    transmitter = self._succeed(transmitter)
-                self._transmitters.adopt(transmitter, lock)
+                    transmitter = self._replace_transmitter(transmitter)
+                self._transmitters.restart_grid(transmitter, lock)
         return transmitter
 
-    def _succeed(self, old: Transmitter) -> Transmitter:
-        """End a transmitter that another is in the place of; what was read since, or rejected, is not its."""
-        self._flush(old)
+    def _replace_transmitter(self, old: Transmitter) -> Transmitter:
+        """End a transmitter whose place another has taken; discard its unconfirmed frames and misses."""
+        self._flush_pending(old)
         self.counts["restarts"] += 1
-        self._discarded(old.doubtful)
-        old.missed[Skipped.REJECTED] -= old.doubtful[Skipped.REJECTED]
-        packet, frame = divmod(old.given, self._packet.frames)
-        self.counts["frames"] -= self._queue.end_after(old.packets, (packet - (old.first or 0), frame))
+        self._uncount(old.unconfirmed)
+        old.missed[Skipped.REJECTED] -= old.unconfirmed[Skipped.REJECTED]
+        packet, frame = divmod(old.last_confirmed, self._packet.frames)
+        self.counts["frames"] -= self._queue.end_frames_after(
+            old.assembler, (packet - (old.first_packet or 0), frame)
+        )
         self._ended.append((old.number, old.region.positions.place_at(old.region.latest.t_us), old.missed))
-        return self._transmitters.succeed(old)
+        return self._transmitters.replace(old)
 
-    def _late_rows(self, transmitter: Transmitter, lock: SyncLock) -> SyncLock:
-        """A lock with what its preamble, and those before, say of the rows of its bar."""
+    def _correct_row_delay(self, transmitter: Transmitter, lock: SyncLock) -> SyncLock:
+        """Add to a lock the row delay of its bar, as measured in this preamble and those before."""
         region = transmitter.region
         middle_us = lock.packet_t_us + self._packet.preamble_chips / 2 * lock.chip_us
         _, y_px = region.positions.place_at(middle_us)
         _, height_px = region.positions.size_at(middle_us)
         row_us, sigma_us = measure_row_delay(self._preamble, lock, region.pieces, y_px, height_px)
         if math.isfinite(row_us):
-            transmitter.rows = transmitter.rows.measured(row_us, sigma_us)
-        return transmitter.rows.delayed(lock, height_px)
+            transmitter.row_delay = transmitter.row_delay.update(row_us, sigma_us)
+        return transmitter.row_delay.apply_to(lock, height_px)
 
-    def _decode_ahead(self, transmitter: Transmitter, until_us: float) -> None:
+    def _decode_early(self, transmitter: Transmitter, until_us: float) -> None:
         """Decode the next frame before its time step is over.
 
-        One that cannot be given is left to the step's end: by then a lock may say that the transmitter has
-        begun anew. So is one that others wait before.
+        A frame that is skipped is left to the end of the step: by then a lock may show that another
+        transmitter has begun. So is one while earlier frames are pending.
         """
-        due = transmitter.grid.due(until_us)
-        if due is None or transmitter.region.id in self._joined:
+        due = transmitter.grid.next_due(until_us)
+        if due is None or transmitter.region.id in self._dropped:
             return
         if self._is_steady(transmitter):
-            self._hand_over(transmitter, due)
+            self._submit_frame(transmitter, due)
             return
-        if self._waiting(transmitter):
+        if self._pending_of(transmitter):
             return
         state = transmitter.fetch_state()
-        found = self._decode(transmitter, due)
+        found = self._decode_frame(transmitter, due)
         if isinstance(found, Skipped):
-            transmitter.state, transmitter.tried, transmitter.strayed = state, due.number, True
+            transmitter.state, transmitter.last_tried, transmitter.strayed = state, due.number, True
             return
-        self._take(transmitter, due, found)
+        self._queue_frame(transmitter, due, found)
 
     def _decode_due(self, transmitter: Transmitter, until_us: float, most: float = math.inf) -> None:
-        """Decode the frames that lie before a time with the events after their last edge, so many at most."""
+        """Decode the frames whose events are all there before a time, `most` at most."""
         cut_us = transmitter.region.cut_us
         if cut_us is not None and transmitter.grid.lock is not None:
             self.counts["frames_cut"] += transmitter.grid.skip_before(cut_us)
-        while most > 0 and (due := transmitter.grid.due(until_us)) is not None:
+        while most > 0 and (due := transmitter.grid.next_due(until_us)) is not None:
             most -= 1
             if until_us - due.read_us <= self._step_us and self._is_steady(transmitter):
-                self._hand_over(transmitter, due)
+                self._submit_frame(transmitter, due)
                 continue
-            if self._waiting(transmitter):
-                self._flush(transmitter)
+            if self._pending_of(transmitter):
+                self._flush_pending(transmitter)
                 continue
             transmitter.fetch_state()
-            found = self._decode(transmitter, due)
-            if found is Skipped.REJECTED and self._put_together(transmitter):
+            found = self._decode_frame(transmitter, due)
+            if found is Skipped.REJECTED and self._unite_parts(transmitter):
                 continue
-            if transmitter.region.id in self._joined:
+            if transmitter.region.id in self._dropped:
                 # Another region shows the frame.
                 transmitter.grid.go_to(due.number + 1)
                 return
@@ -382,80 +393,76 @@ class PacketFraming(Framer):
                 transmitter.strayed = True
                 transmitter.grid.go_to(due.number + 1)
                 if found is not Skipped.DARK:
-                    self._lit_in(transmitter, self._clock.camera_us(due.start_us))
+                    self._record_light(transmitter, self._clock.camera_us(due.start_us))
                     transmitter.missed[found] += 1
-                    known = transmitter.number is not None and due.number > transmitter.given
+                    known = transmitter.number is not None and due.number > transmitter.last_confirmed
                     if found is Skipped.REJECTED and known:
-                        transmitter.doubtful[found] += 1
-                        transmitter.packets.in_doubt = True
+                        transmitter.unconfirmed[found] += 1
+                        transmitter.assembler.unconfirmed = True
                 self.counts[found] += 1
                 self._announce_skipped(transmitter, due, found)
                 continue
-            self._take(transmitter, due, found)
+            self._queue_frame(transmitter, due, found)
 
     def _announce_skipped(self, transmitter: Transmitter, due: DueFrame, why: Skipped) -> None:
         if self._announcer is not None:
-            packet = None if transmitter.first is None else due.packet - transmitter.first
+            packet = None if transmitter.first_packet is None else due.packet - transmitter.first_packet
             t_us = self._clock.camera_us(due.start_us)
             skipped = SkippedFrame(transmitter.number, packet, due.index, t_us, why.value, self._name)
-            self._announcer.lap("skipped", skipped)
+            self._announcer.announce("skipped", skipped)
 
-    def _take(self, transmitter: Transmitter, due: DueFrame, found: FrameDetection) -> None:
-        """Hand a frame on."""
+    def _queue_frame(self, transmitter: Transmitter, due: DueFrame, found: FrameDetection) -> None:
         if transmitter.grid.frame <= due.number:
             transmitter.grid.go_to(due.number + 1)
-        if not transmitter.doubtful:
-            transmitter.given = max(due.number, transmitter.given)
-        self._lit_in(transmitter, found.frame.t_us)
+        if not transmitter.unconfirmed:
+            transmitter.last_confirmed = max(due.number, transmitter.last_confirmed)
+        self._record_light(transmitter, found.frame.t_us)
         self.counts["frames"] += 1
-        self._queue.add(transmitter.packets, found)
+        self._queue.add(transmitter.assembler, found)
 
-    def _lit_in(self, transmitter: Transmitter, start_us: float) -> None:
-        """Note that a transmitter's light is there in a frame that is due, by its start, camera clock, us."""
-        if transmitter.lit_us is None:
-            transmitter.lit_us = start_us
+    def _record_light(self, transmitter: Transmitter, start_us: float) -> None:
+        """Record that a transmitter's light was there in a frame that started then, camera clock, us."""
+        if transmitter.first_lit_us is None:
+            transmitter.first_lit_us = start_us
         if transmitter.number is not None:
-            note_lit(self.lit, transmitter.number, transmitter.lit_us, start_us)
+            record_light(self.light_spans_us, transmitter.number, transmitter.first_lit_us, start_us)
 
-    def _decode(self, transmitter: Transmitter, due: DueFrame) -> FrameDetection | Skipped:
-        """Read a frame, or say why it is not given."""
+    def _decode_frame(self, transmitter: Transmitter, due: DueFrame) -> FrameDetection | Skipped:
         if self._announcer is not None:
-            self._announcer.start()
-        due = self._retimed(transmitter, due)
-        aligned = self._align(transmitter, due)
+            self._announcer.start_clock()
+        due = self._retime_frame(transmitter, due)
+        aligned = self._align_frame(transmitter, due)
         if aligned is None:
-            return Skipped.DARK if _went_dark(transmitter, due, self._packet) else Skipped.REJECTED
-        if transmitter.number is None and self._reflections.shown(due.start_us, aligned.centre_px):
+            return Skipped.DARK if _is_dark(transmitter, due, self._packet) else Skipped.REJECTED
+        if transmitter.number is None and self._reflections.has_frame_at(due.start_us, aligned.centre_px):
             # The same bar once more: where the first region was then is not known as well as what it showed.
             self._regions.drop(transmitter.region)
-            self.let_go(transmitter.region)
+            self.forget_region(transmitter.region)
             return Skipped.REJECTED
         attitude = self._attitude_at(self._clock.camera_us(due.middle_us)) if due.has_pilot else None
-        ranged = due.has_pilot and self._is_ranged()
+        ranged = due.has_pilot and self._take_ranging_turn()
         known = transmitter.number is not None
         found, transmitter.state = self._decoder.read(
             aligned, due, transmitter.state, attitude, ranged=ranged, known=known
         )
         self.counts["frames_not_ranged"] += due.has_pilot and not ranged
-        if not found.given:
-            self._note(transmitter, "frames_askew", found.reading.sight.askew)
+        if not found.is_readable:
+            self._add_count(transmitter, "frames_askew", found.reading.line_of_sight.askew)
             return Skipped.UNREAD
         if not known:
-            self._find_parts(transmitter.region, due.start_us)
-        self._transmitters.number(transmitter)
-        frame = self._frame(transmitter, due, found)
-        self._tell(frame)
-        return self._detection(transmitter, due, found, frame)
+            self._claim_ended_parts(transmitter.region, due.start_us)
+        self._transmitters.assign_number(transmitter)
+        frame = self._publish_frame(transmitter, due, found)
+        return self._build_detection(transmitter, due, found, frame)
 
-    def _frame(self, transmitter: Transmitter, due: DueFrame, found: FrameResult) -> Frame:
-        """What is given of a frame."""
+    def _publish_frame(self, transmitter: Transmitter, due: DueFrame, found: FrameResult) -> Frame:
         reading = found.reading
-        if transmitter.first is None:
-            transmitter.first = due.packet
+        if transmitter.first_packet is None:
+            transmitter.first_packet = due.packet
         assert transmitter.number is not None
-        return Frame(
+        frame = Frame(
             transmitter=transmitter.number,
-            packet=due.packet - transmitter.first,
+            packet=due.packet - transmitter.first_packet,
             frame=due.index,
             t_us=self._clock.camera_us(due.start_us),
             soft=reading.soft,
@@ -470,68 +477,64 @@ class PacketFraming(Framer):
             echo_of=self._reflections.echo_of(transmitter.number),
             link=self._name,
         )
-
-    def _tell(self, frame: Frame) -> None:
         if self._on_frame is not None:
             self._on_frame(frame)
         if self._announcer is not None:
-            self._announcer.frame(frame)
+            self._announcer.announce_frame(frame)
+        return frame
 
-    def _detection(
+    def _build_detection(
         self, transmitter: Transmitter, due: DueFrame, found: FrameResult, frame: Frame
     ) -> FrameDetection:
-        """A frame with what tells a bar from its reflection; counts what it notes."""
-        self._note(transmitter, "frames_askew", found.reading.sight.askew)
-        self._note(transmitter, "frames_flooded", found.reading.flooded)
+        """The detection of a decoded frame; counts what its reading warns of."""
+        self._add_count(transmitter, "frames_askew", found.reading.line_of_sight.askew)
+        self._add_count(transmitter, "frames_flooded", found.reading.flooded)
         times = due.start_us, due.end_us, due.packet_us, due.lock.chip_us
         return FrameDetection(frame, *times, found.cells, found.seen, found.mirrored, found.reading.spread)
 
     def _is_steady(self, transmitter: Transmitter) -> bool:
         """Whether frames of a transmitter can be decoded by themselves.
 
-        What sweeps over the image is a region off by more than its seam soon: each frame sets it right.
+        A region that sweeps over the image is soon off by more than its seam: each of its frames has to
+        correct it.
         """
         still = transmitter.region.speed == STILL and self._follower is not None
         return still and not transmitter.strayed and transmitter.number is not None
 
-    def _hand_over(self, transmitter: Transmitter, due: DueFrame) -> None:
-        """Have a frame decoded by itself."""
+    def _submit_frame(self, transmitter: Transmitter, due: DueFrame) -> None:
         if self._announcer is not None:
-            self._announcer.start()
+            self._announcer.start_clock()
         assert transmitter.number is not None
         if transmitter.decoder is None:
-            transmitter.decoder = min(self._bars, key=len)
-            transmitter.decoder.put(transmitter.number, transmitter.state)
-        due = self._retimed(transmitter, due)
-        ranged = due.has_pilot and self._is_ranged()
+            transmitter.decoder = min(self._bar_decoders, key=len)
+            transmitter.decoder.put_state(transmitter.number, transmitter.state)
+        due = self._retime_frame(transmitter, due)
+        ranged = due.has_pilot and self._take_ranging_turn()
         middle_us = self._clock.camera_us(due.middle_us)
         attitude = self._attitude_at(middle_us) if due.has_pilot else None
         job = FrameJob(transmitter.region, due, attitude, ranged)
-        answer = transmitter.decoder.decode(transmitter.number, job)
+        fetch_result = transmitter.decoder.decode(transmitter.number, job)
         frame = None
-        if transmitter.decoder.at_once and (found := answer()) is not None:
-            frame = self._frame(transmitter, due, found)
-            self._tell(frame)
-        self._pending.append(PendingFrame(transmitter, due, self._now_us, ranged, answer, frame))
+        if transmitter.decoder.is_immediate and (found := fetch_result()) is not None:
+            frame = self._publish_frame(transmitter, due, found)
+        self._pending.append(PendingFrame(transmitter, due, self._now_us, ranged, fetch_result, frame))
         transmitter.grid.go_to(due.number + 1)
 
-    def _waiting(self, transmitter: Transmitter) -> list[PendingFrame]:
-        """Frames of a transmitter that are decoded, and not applied."""
+    def _pending_of(self, transmitter: Transmitter) -> list[PendingFrame]:
         return [one for one in self._pending if one.transmitter is transmitter]
 
-    def _flush(self, transmitter: Transmitter) -> None:
-        """Apply all frames of a transmitter that are decoded."""
-        while waiting := self._waiting(transmitter):
-            self._pending.remove(waiting[0])
-            self._apply(waiting[0])
+    def _flush_pending(self, transmitter: Transmitter) -> None:
+        while pending := self._pending_of(transmitter):
+            self._pending.remove(pending[0])
+            self._apply_frame(pending[0])
 
-    def _apply(self, pending: PendingFrame) -> None:
-        """Let a frame that was decoded by itself set its region right, and hand it on."""
-        transmitter, due, found = pending.transmitter, pending.due, pending.answer()
+    def _apply_frame(self, pending: PendingFrame) -> None:
+        """Correct a region by a pending frame, and queue the frame."""
+        transmitter, due, found = pending.transmitter, pending.due, pending.fetch_result()
         if found is None:
-            # It, and those after it, are decoded here: with what is around.
-            for one in self._waiting(transmitter):
-                one.answer()
+            # This frame, and those after it, are decoded here, with what surrounds the region.
+            for one in self._pending_of(transmitter):
+                one.fetch_result()
                 self._pending.remove(one)
             transmitter.fetch_state()
             transmitter.strayed = True
@@ -541,34 +544,31 @@ class PacketFraming(Framer):
         assert follower is not None
         if shown is not None and not region.released:
             follower.shape(region, shown)
-            if not self._join(region, shown.t_us):
+            if not self._drop_duplicates(region, shown.t_us):
                 return
-            self._open_beside(region, shown)
-        frame = self._frame(transmitter, due, found) if pending.frame is None else pending.frame
-        if pending.frame is None:
-            self._tell(frame)
+            self._open_other_images(region, shown)
+        frame = self._publish_frame(transmitter, due, found) if pending.frame is None else pending.frame
         self.counts["frames_not_ranged"] += due.has_pilot and not pending.ranged
-        self._take(transmitter, due, self._detection(transmitter, due, found, frame))
+        self._queue_frame(transmitter, due, self._build_detection(transmitter, due, found, frame))
 
-    def _open_beside(self, region: Followed, shown: ShownPlace) -> None:
-        """Open regions for other images of a bar that are not followed yet."""
+    def _open_other_images(self, region: Followed, shown: ShownPlace) -> None:
         assert self._follower is not None
         for centre_px, size_px in shown.others:
             known = any(one.covers(shown.t_us, centre_px) for one in self._regions.alive)
             if not known and self._follower.has_room():
                 self._due.append(self._follower.beside(region, shown.t_us, centre_px, size_px))
 
-    def _retimed(self, transmitter: Transmitter, due: DueFrame) -> DueFrame:
-        """A frame that is due, timed anew where light has changed since the preamble."""
+    def _retime_frame(self, transmitter: Transmitter, due: DueFrame) -> DueFrame:
+        """Time a frame that is due anew where the light has changed since the preamble."""
         grid, region, fewest = transmitter.grid, transmitter.region, transmitter.step_events
         inside = []
         for piece in region.pieces:
             if due.start_us < piece[0] + self._step_us <= due.end_us:
                 inside.append(piece)
                 fewest = min(fewest, piece[1].t_us.size)
-        if region.size_px is None or _DIMMED * fewest > transmitter.step_events:
+        if region.size_px is None or _DIMMED_RATIO * fewest > transmitter.step_events:
             return due
-        lock = retime(due.lock, due.start_us, inside)
+        lock = retime_lock(due.lock, due.start_us, inside)
         if lock is due.lock:
             return due
         transmitter.step_events, grid.lock = fewest, lock
@@ -576,40 +576,40 @@ class PacketFraming(Framer):
         assert grid.next is not None
         return grid.next
 
-    def _note(self, transmitter: Transmitter, name: str, many: int) -> None:
-        """Count something of a frame, as doubtful as the frame is."""
-        self.counts[name] += many
-        if transmitter.doubtful:
-            transmitter.doubtful[name] += many
+    def _add_count(self, transmitter: Transmitter, name: str, count: int) -> None:
+        """Add to a count; it stays unconfirmed while the transmitter's frames are."""
+        self.counts[name] += count
+        if transmitter.unconfirmed:
+            transmitter.unconfirmed[name] += count
 
-    def _is_ranged(self) -> bool:
-        """Whether the turn of a frame with a pilot has come to be ranged."""
-        self._measurable += 1
-        return self._measurable % self.ranging_every == 0
+    def _take_ranging_turn(self) -> bool:
+        """Whether this frame with a pilot, each `ranging_every`-th one, is to be ranged."""
+        self._pilot_frames += 1
+        return self._pilot_frames % self.ranging_every == 0
 
-    def _align(self, transmitter: Transmitter, due: DueFrame) -> AlignedFrame | None:
-        """Look at a frame; set its region right by it, join what is of the same bar, open what is another."""
+    def _align_frame(self, transmitter: Transmitter, due: DueFrame) -> AlignedFrame | None:
+        """Align a frame and correct its region by it; drop duplicates of the bar, open its other images."""
         region, follower = transmitter.region, self._follower
         seen: list[ShownPlace] = []
         most_px = 0.0
-        for _ in range(_LOOKS):
-            whole = region.size_px is not None
+        for _ in range(_MAX_ALIGNMENTS):
+            bar_known = region.size_px is not None
             aligned = self._aligner.align(region, due, transmitter.state.pilot)
             if aligned is None or not due.has_pilot:
                 break
             transmitter.state = transmitter.state._replace(pilot=aligned.pilot)
-            shown = self._decoder.shown_place(aligned)
+            shown = self._decoder.locate_bar(aligned)
             if follower is None:
                 region.size_px = shown.size_px
                 break
-            # What the first look shows beside the bar is out of the second one's sight.
+            # The next alignment may no longer see what this one shows beside the bar.
             seen.append(shown)
             off_px = follower.shape(region, shown)
             most_px = max(most_px, off_px)
-            if off_px > 0 and not self._join(region, shown.t_us):
+            if off_px > 0 and not self._drop_duplicates(region, shown.t_us):
                 return None
-            # Within half of the seam, motion in the frame is known as well as by its next look.
-            if off_px == 0 or (whole and off_px <= MARGIN_PX / 2):
+            # Within half of the seam, another alignment would not know the motion in the frame better.
+            if off_px == 0 or (bar_known and off_px <= MARGIN_PX / 2):
                 break
             follower.gather(region, due.start_us, due.read_us)
         if follower is not None and most_px > MARGIN_PX / 2:
@@ -617,96 +617,95 @@ class PacketFraming(Framer):
         if due.has_pilot:
             transmitter.strayed = most_px > MARGIN_PX / 2
         for shown in seen if aligned is not None else ():
-            self._open_beside(region, shown)
+            self._open_other_images(region, shown)
         return aligned
 
-    def _join(self, region: Followed, t_us: float) -> bool:
-        """Let other regions of the bar seen at a time go; False if this one goes, as the other is known."""
+    def _drop_duplicates(self, region: Followed, t_us: float) -> bool:
+        """Drop other regions of a bar; if a known one has it already, drop this region and return False."""
         for other in list(self._regions.alive):
             if other is region or not region.holds(other, t_us, SAME_PX):
                 continue
             gone = region if other.size_px is not None and other.id < region.id else other
             self._regions.drop(gone)
-            self.let_go(gone)
+            self.forget_region(gone)
             if gone is region:
                 return False
         return True
 
-    def _put_together(self, transmitter: Transmitter) -> bool:
-        """Unite a region that shows too little of a bar with others in step with it, if there are any."""
-        parts = self._transmitters.in_step(transmitter)
-        if self._follower is None or transmitter.region.id in self._joined or not parts:
+    def _unite_parts(self, transmitter: Transmitter) -> bool:
+        """Unite a region that shows a part of a bar with others in step with it; False without any."""
+        parts = self._transmitters.find_in_step(transmitter)
+        if self._follower is None or transmitter.region.id in self._dropped or not parts:
             return False
         for part in parts:
             self._follower.unite(transmitter.region, part.region)
-            self.let_go(part.region)
+            self.forget_region(part.region)
         return True
 
-    def let_go(self, region: Followed) -> None:
+    def forget_region(self, region: Followed) -> None:
         """Forget a region that has become a part of another, or whose place is another's."""
-        self._joined.add(region.id)
+        self._dropped.add(region.id)
         transmitter = self._transmitters.alive.get(region.id)
         if transmitter is not None:
-            self._flush(transmitter)
+            self._flush_pending(transmitter)
             self.counts["regions_released"] += 1
-            self._was_part(transmitter.missed)
-            self._queue.add(transmitter.packets, None)
+            self._count_as_parts(transmitter.missed)
+            self._queue.add(transmitter.assembler, None)
             self._transmitters.release(transmitter)
 
-    def _was_part(self, missed: Counter[str]) -> None:
-        """Count the frames that a part of a bar could not show apart from those that no bar shows."""
-        self.counts["frames_of_parts"] += self._discarded(missed)
+    def _count_as_parts(self, missed: Counter[str]) -> None:
+        """Count misses of a part of a bar apart from those of whole bars."""
+        self.counts["frames_of_parts"] += self._uncount(missed)
 
-    def _find_parts(self, region: Followed, t_us: float) -> None:
-        """Look among the regions that ended for parts of a bar whose first frame is read."""
+    def _claim_ended_parts(self, region: Followed, t_us: float) -> None:
+        """Find regions that ended and were parts of a bar whose first frame is decoded."""
         for one in list(self._ended):
             number, place_px, missed = one
             if number is None and _is_part(region, t_us, place_px, self._fade_us):
                 self._ended.remove(one)
-                self._was_part(missed)
+                self._count_as_parts(missed)
 
-    def _end(self, transmitter: Transmitter, now_us: float) -> None:
+    def _end_transmitter(self, transmitter: Transmitter, now_us: float) -> None:
         """Decode what a region that has ended still shows; its last packet is over."""
         seen_us = transmitter.region.latest.t_us + self._step_us
         until_us = min(now_us - self._tail_us, seen_us)
         self._decode_due(transmitter, until_us)
-        while self._waiting(transmitter):
-            self._flush(transmitter)
+        while self._pending_of(transmitter):
+            self._flush_pending(transmitter)
             self._decode_due(transmitter, until_us)
-        if transmitter.region.id in self._joined:
+        if transmitter.region.id in self._dropped:
             return
         number, missed = transmitter.number, transmitter.missed
         if missed:
             place_px = transmitter.region.positions.place_at(seen_us)
             bars = [one for one in self._regions.alive if one is not transmitter.region and one.size_px]
             if number is None and any(_is_part(bar, seen_us, place_px, self._fade_us) for bar in bars):
-                self._was_part(missed)
+                self._count_as_parts(missed)
             else:
                 self._ended.append((number, place_px, missed))
-        self._queue.add(transmitter.packets, None)
+        self._queue.add(transmitter.assembler, None)
 
 
-def _in_time(transmitter: Transmitter) -> bool:
-    """Whether a transmitter's next frame is decoded when it is due: not before one has shown the bar.
+def _can_decode_early(transmitter: Transmitter) -> bool:
+    """Whether a transmitter's next frame can be decoded as soon as it is due.
 
-    Nor as long as older ones wait.
+    Not before a frame has shown the bar, nor while older frames are overdue.
     """
     known = transmitter.number is not None and transmitter.region.size_px is not None
-    return known and not transmitter.behind and transmitter.tried != transmitter.grid.frame
+    return known and not transmitter.is_behind and transmitter.last_tried != transmitter.grid.frame
 
 
 def _is_part(bar: Followed, t_us: float, place_px: tuple[float, float], fade_us: float) -> bool:
-    """Whether what was seen somewhere may have been a part of a bar, or what it has left to fade."""
+    """Whether what was seen somewhere may have been a part of a bar, or its fading trail."""
     (x, y), before = bar.positions.place_at(t_us), bar.positions.place_at(t_us - fade_us)
     width, height = bar.positions.size_at(t_us)
     right, down = abs(place_px[0] - x) - abs(before[0] - x), abs(place_px[1] - y) - abs(before[1] - y)
-    return right <= width / 2 + _PART_PX and down <= height / 2 + _PART_PX
+    return right <= width / 2 + _PART_MARGIN_PX and down <= height / 2 + _PART_MARGIN_PX
 
 
-def _went_dark(transmitter: Transmitter, due: DueFrame, packet: PacketFormat) -> bool:
-    """Whether a bar that was seen before has few events in a frame by now."""
+def _is_dark(transmitter: Transmitter, due: DueFrame, packet: PacketFormat) -> bool:
     pilot = transmitter.state.pilot
     if transmitter.number is None or pilot is None:
         return False
     expected = int(np.abs(pilot.sums).sum(dtype=np.int64)) * due.chips / packet.pilot_chips
-    return transmitter.region.events_between(due.start_us, due.end_us) < _DARK * expected
+    return transmitter.region.events_between(due.start_us, due.end_us) < _DARK_SHARE * expected

@@ -1,4 +1,4 @@
-"""What a frame says, as the link's algorithms read it, and how far that is believed."""
+"""Decodes one frame at a time by the link's algorithms, and calibrates how sure its symbols are."""
 
 import math
 from collections.abc import Callable
@@ -25,42 +25,45 @@ from evlcp_sdk.scene.tilt import LineOfSight, line_of_sight, magnification_of
 from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
 
 _FRAME_WORTH = 6.0
-"""LLRs of a cluster that those of all its frame are worth: light and shaking are much the same for all,
-while a panel or leaves stand behind some."""
+"""LLRs of a cluster that those of all its frame are worth: light and vibration are much the same for all,
+while some have a panel or leaves behind them."""
 
 _EXPECTED_SPREAD, _EXPECTED_WORTH = 0.4, 6.0
-"""Standard deviation of the sizes of LLRs, in their mean, before any is seen, and how many it is worth."""
+"""Standard deviation of the sizes of LLRs, in their mean, before any is known, and how many LLRs it is
+worth."""
 
-_LEAST_SURE = 0.6
-"""Probability of being right against its nearest rival below which a symbol is not given: it has others, too,
-and of those that are less sure, half or more are wrong in recordings."""
+_MIN_PROBABILITY = 0.6
+"""Probability of being right against its nearest rival below which a symbol is not given: it has other
+rivals, too, and of less sure symbols half or more are wrong in recordings."""
 
-_TOGETHER = 1.7
-"""Wrong symbols in a frame that has any: what makes one wrong, light, shaking, what stands behind, is there
-for others, too. In `examples/campaigns/road.toml` they are 1.9 to 2.2 by decoding, as `benchmarks/quality.py`
-prints; on a Gaussian channel 1 to 1.3, as long as less than half of the frames are wrong."""
+_ERRORS_TOGETHER = 1.7
+"""Wrong symbols in a frame that has any: what makes one wrong, light, vibration, background, affects others,
+too. In `examples/campaigns/road.toml` they are 1.9 to 2.2 by decoding, as `benchmarks/quality.py` prints; on
+a Gaussian channel 1 to 1.3, as long as less than half of the frames are wrong."""
 
-_LEAST_EVENTS = 0.5
-"""Share of the events due, by the edges of the codeword with the fewest, that may be missing by chance."""
+_MIN_EVENT_SHARE = 0.5
+"""Share of the expected events, by the edges of the codeword with the fewest, that may be missing by
+chance."""
 
-_FLOODED, _MORE, _DIMMED = 0.2, 1.25, 0.45
-"""Share of a cluster's events that come, more than in the pilot, where no cluster is, while half of the info
-has so many times the pilot's or more; and share of the pilot's that half of it has: the light of all changes,
-and nothing that the pilot showed holds. What moves, shines or blinks beside a bar makes 0.14 and 0.65 at the
-most in recordings, steps of light 0.28 and 0.38; a bar that leaves its place has no more events than before.
-In pair codes every symbol has half of the pilot's edges; in others some have none for long."""
+_FLOODED_SHARE, _FLOODED_RATIO, _DIMMED_SHARE = 0.2, 1.25, 0.45
+"""A frame is flooded, its light changes everywhere and nothing that the pilot showed holds, if in pixels
+without a cluster info events exceed the pilot's by more than this share of a cluster's while half of the info
+segment has so many times the pilot's events or more; or if half of it has less than that share of the
+pilot's. What moves, shines or blinks beside a bar makes 0.14 and 0.65 at most in recordings, steps of light
+0.28 and 0.38; a bar that leaves its place has no more events than before. In pair codes every symbol has half
+of the pilot's edges; in others some have none for long."""
 
-_SURE = 0.98
-"""Quality of a frame from which on its symbols hold, whatever the light of all does: where they are wrong, it
-is less. A halo and a jolt look like a step of light now and then."""
+_SURE_QUALITY = 0.98
+"""Quality of a frame from which on its symbols hold, however the light changes: where they are wrong, it is
+less. A halo and a jolt look like a step of light now and then."""
 
-_NO_RANGE, _NO_SIGHT = Range(math.nan, math.nan, 0), LineOfSight()
+_NO_RANGE, _NO_LINE_OF_SIGHT = Range(math.nan, math.nan, 0), LineOfSight()
 
 _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
 
 
 class Steps:
-    """The roles that read a frame; it keeps no state of a stream."""
+    """The algorithms that decode a frame, checked and announced; it keeps no state of a stream."""
 
     def __init__(self, link: Link, announcer: Announcer | None, tracker: Tracker) -> None:
         self._codebook = link.codebook
@@ -73,19 +76,19 @@ class Steps:
         self._measure = compiled(link, "ranging", link.camera, link.bar, book)
         self._distance = tracker.distance
 
-    def distance_init(self) -> tuple[Ranges, Any]:
-        """What is known of a transmitter's distance before its first frame."""
+    def init_distance(self) -> tuple[Ranges, Any]:
+        """State of a transmitter's distance before its first frame."""
         return Ranges(), None if self._distance is None else self._distance.init()
 
     def separate(self, sums: NDArray[np.int16]) -> PresenceMap:
-        """Where the clusters are, from a pilot's polarity sums, int16 (chips, height, width)."""
+        """Find the clusters in a pilot's polarity sums, int16 (chips, height, width)."""
         guard = self._guards["separation"]
         with guard:
             presence: PresenceMap = self._separate(sums)
         if guard.checks:
             guard.expect_presence(presence, self._codebook.clusters, *sums.shape[1:])
         if self._announcer is not None:
-            self._announcer.lap("separation", presence)
+            self._announcer.announce("separation", presence)
         return presence
 
     def decode(
@@ -95,10 +98,10 @@ class Steps:
         before: NDArray[np.int8],
         after: NDArray[np.int8],
     ) -> SoftSymbols:
-        """What the clusters say, from the polarity sums of pilot and info, int16 (chips, height, width).
+        """Decode the clusters' symbols from polarity sums of pilot and info, int16 (chips, height, width).
 
-        To codes that are no pair codes the chips sent before and after the info segment matter, and the sums
-        have the one after it, too.
+        For codes that are no pair codes the chips sent before and after the info segment matter, and the sums
+        include the chip after it.
         """
         guard = self._guards["decoding"]
         more = () if self._codebook.pairs else (before, after)
@@ -107,63 +110,67 @@ class Steps:
         if guard.checks:
             guard.expect_symbols(soft, self._codebook)
         if self._announcer is not None:
-            self._announcer.lap("decoding", soft)
+            self._announcer.announce("decoding", soft)
         return soft
 
     def measure(self, view: FrameView) -> Range:
-        """How far the bar is."""
+        """Measure the distance of the bar."""
         guard = self._guards["ranging"]
         if self._announcer is not None:
-            self._announcer.lap("view", view)
+            self._announcer.announce("view", view)
         with guard:
             distance: Range = self._measure(view)
         if guard.checks:
             guard.expect_range(distance)
         if self._announcer is not None:
-            self._announcer.lap("ranging", distance)
+            self._announcer.announce("ranging", distance)
         return distance
 
-    def follow(
-        self, state: tuple[Ranges, Any], t_us: float, chip_us: float, measured: Range, sight: LineOfSight
+    def track_distance(
+        self,
+        state: tuple[Ranges, Any],
+        t_us: float,
+        chip_us: float,
+        measured: Range,
+        line_of_sight: LineOfSight,
     ) -> tuple[tuple[Ranges, Any], Range, Range | None]:
-        """Take a frame's distance as the ranging gave it; the new state, the distance, and that filtered.
+        """Correct and filter a frame's distance; return the new state, the distance, and the filtered one.
 
-        The sight says where its bar is seen, and what the attitude says of its lean. The filtered one is
-        the prediction where a frame allows no distance, None without tracking.
+        The filtered distance is the prediction where a frame allows none, and None without tracking.
         """
-        ranges, distance = self._keeper.step(state[0], t_us, chip_us, measured, sight)
-        filter_state, filtered = self._filter(state[1], t_us, distance)
+        ranges, distance = self._keeper.step(state[0], t_us, chip_us, measured, line_of_sight)
+        filter_state, filtered = self._filter_distance(state[1], t_us, distance)
         return (ranges, filter_state), distance, filtered
 
-    def _filter(self, state: Any, t_us: float, measured: Range) -> tuple[Any, Range | None]:
+    def _filter_distance(self, state: Any, t_us: float, measured: Range) -> tuple[Any, Range | None]:
         if self._distance is None:
             return state, None
         if not (math.isfinite(measured.distance_m) and math.isfinite(measured.sigma_m)):
             expected = self._distance.predict(state, t_us)
             return state, None if expected is None else Range(float(expected[0][0]), expected[1], 0)
         value, standing_m = np.array([measured.distance_m]), measured.standing_m
-        # What stays over frames is not filtered out.
+        # What stays over frames cannot be filtered out.
         new_m = math.sqrt(max(measured.sigma_m**2 - standing_m**2, 0.0))
         state, value, sigma = self._distance.step(state, t_us, value, new_m)
         return state, Range(float(value[0]), math.hypot(sigma, standing_m), measured.pairs)
 
 
-class Reading(NamedTuple):
-    """What a frame says.
+class FrameReading(NamedTuple):
+    """What was decoded and measured in a frame.
 
     Attributes:
-        symbols: As the decoding read them, int64 (K,).
-        soft: What can be believed.
-        distance: As the ranging gave it; its values are NaN where none was asked for.
+        symbols: As decoded, int64 (K,).
+        soft: Calibrated, see `calibrate_llr`.
+        distance: As measured; its values are NaN where none was asked for.
         points_px: Column and row of each cluster's centre on the sensor, px, float64 (K, 2), NaN where
-            unseen; empty of a frame without a pilot, as the sigmas are.
+            unseen; empty without a pilot, as the sigmas are.
         sigma_px: Their standard deviations, px, float64 (K,).
         flank_px: See `Frame.points_flank_px`.
         centre_px: Column and row of the bar's centre on the sensor, px.
-        sight: Where its bar is seen, and what the attitude says of its lean; the default one of a panel,
+        line_of_sight: Of the bar, with its tilt as far as the attitude gives it; the default one for a panel,
             which has no direction.
-        spread: Measures how light spreads in it; None of a frame without a pilot.
-        flooded: Whether the light of all changes in it, so that no symbol is given.
+        spread: Measures how light spreads in it; None without a pilot.
+        flooded: Light changes everywhere in it, so that no symbol is given.
     """
 
     symbols: NDArray[np.int64]
@@ -173,7 +180,7 @@ class Reading(NamedTuple):
     sigma_px: NDArray[np.float64]
     flank_px: float
     centre_px: tuple[float, float]
-    sight: LineOfSight
+    line_of_sight: LineOfSight
     spread: Callable[[], Spread] | None
     flooded: bool
 
@@ -183,9 +190,9 @@ class BarState(NamedTuple):
 
     Attributes:
         pilot: The newest pilot; None where it showed no bar, and before the first.
-        frame: Number of the newest frame that was decoded, on the packet grid; -1 before the first.
+        frame: Number of the newest decoded frame on the packet grid; -1 before the first.
         symbols: Its symbols, int64 (K,).
-        distance: What is known of the distance.
+        distance: State of its distance, see `Steps.track_distance`.
     """
 
     pilot: Pilot | None
@@ -195,34 +202,34 @@ class BarState(NamedTuple):
 
 
 class FrameResult(NamedTuple):
-    """A frame as it was decoded.
+    """A decoded frame.
 
     Attributes:
-        reading: What it says; its distance as it holds together with those before.
-        filtered: The distance filtered; None without tracking.
+        reading: What was read in it, with its distance as corrected by those before.
+        filtered: The filtered distance; None without tracking.
         cells: Grid cells that show a cluster, on average.
         seen: Clusters that are seen.
         mirrored: The order of the clusters is the opposite of the layout's.
-        given: It says something: a symbol, or of a known transmitter its distance.
-        shown: Where it showed the bar, of one that was decoded by itself; None without a pilot.
+        is_readable: It has a symbol, or, of a known transmitter, a distance.
+        shown: Where it showed the bar, if it was decoded by itself; None without a pilot.
     """
 
-    reading: Reading
+    reading: FrameReading
     filtered: Range | None
     cells: float
     seen: int
     mirrored: bool
-    given: bool
+    is_readable: bool
     shown: ShownPlace | None = None
 
 
 class FrameJob(NamedTuple):
-    """A frame to decode, with what its bar's earlier frames do not say.
+    """A frame to decode, with what its bar's earlier frames do not tell.
 
     Attributes:
         region: Where the bar is, with the events of the frame.
         due: Which frame.
-        attitude: What is known of the camera's attitude in its pilot.
+        attitude: The camera's attitude in its pilot, as far as it is known.
         ranged: Its distance is measured.
     """
 
@@ -233,15 +240,15 @@ class FrameJob(NamedTuple):
 
 
 class FrameReader:
-    """Reads one frame after the other, as the aligner aligned it; it keeps no state of a stream."""
+    """Reads one aligned frame after the other; it keeps no state of a stream."""
 
     def __init__(self, link: Link, steps: Steps, aligner: FrameAligner) -> None:
         centres_m, book = link.bar.cluster_centres_m(), link.codebook
         self._camera = link.camera
         self._is_column = float(np.ptp(centres_m[:, 0])) < 1e-9
         self._pilot_chips = link.packet.pilot_chips
-        self._least_lit = _LEAST_EVENTS * book.least_activity
-        self._least_half = _DIMMED if book.pairs else 0.0
+        self._least_lit = _MIN_EVENT_SHARE * book.least_activity
+        self._least_half = _DIMMED_SHARE if book.pairs else 0.0
         self._steps, self._aligner = steps, aligner
         self._layout = layout_of(centres_m)
         self._pairs = neighbours(self._layout)
@@ -256,36 +263,37 @@ class FrameReader:
         self,
         aligned: AlignedFrame,
         due: DueFrame,
-        before: NDArray[np.int8],
+        last_chips: NDArray[np.int8],
         attitude: Attitude | None,
         *,
         ranged: bool,
-    ) -> Reading:
-        """What a frame that shows its clusters says; one without a pilot has no distance and no points.
+    ) -> FrameReading:
+        """Read a frame that shows its clusters; one without a pilot has no distance and no points.
 
-        `before` is the chip that each cluster sent before its info segment, int8 (K,), -1 if not known; the
-        distance is asked for where it is `ranged`.
+        `last_chips` are those that each cluster sent before its info segment, int8 (K,), -1 if not known; the
+        distance is measured if it is `ranged`.
         """
         sums, presence, placement = aligned.sums, aligned.pilot.presence, aligned.pilot.placement
-        soft = self._steps.decode(presence, aligned.sums_and_next, before, self._behind[due.index])
+        soft = self._steps.decode(presence, aligned.sums_and_next, last_chips, self._behind[due.index])
         lit, images = np.empty_like(placement.seen), (sums, presence.probability, presence.grid_px)
-        # Where a stream has a gap, or a pole passes, silence is not what a cluster says.
-        beside, dim, most = _kernels.find_lit_clusters(
+        # In a gap of the stream, or behind a passing pole, silence is no symbol.
+        outside, darkest, brightest = _kernels.find_lit_clusters(
             *images, self._pilot_chips, self._least_lit, placement.seen, lit
         )
-        given = calibrate_llr(soft, lit)
-        changed = (beside > _FLOODED and most > _MORE) or dim < self._least_half
-        if flooded := changed and given.quality < _SURE:
-            given = calibrate_llr(soft, np.zeros_like(lit))
+        calibrated = calibrate_llr(soft, lit)
+        brightens = outside > _FLOODED_SHARE and brightest > _FLOODED_RATIO
+        changes = brightens or darkest < self._least_half
+        if flooded := changes and calibrated.quality < _SURE_QUALITY:
+            calibrated = calibrate_llr(soft, np.zeros_like(lit))
         if not due.has_pilot:
-            # Another distance of the same pilot, or other points, would say nothing new.
-            return Reading(
+            # Another distance or other points by the same pilot would be nothing new.
+            return FrameReading(
                 soft.symbols,
-                given,
+                calibrated,
                 _NO_RANGE,
                 *_NO_POINTS,
                 aligned.centre_px,
-                _NO_SIGHT,
+                _NO_LINE_OF_SIGHT,
                 spread=None,
                 flooded=flooded,
             )
@@ -293,27 +301,34 @@ class FrameReader:
         if ranged:
             whole = self._aligner.whole(aligned)
             distance = self._steps.measure(FrameView(sums, aligned.offset_px, whole, soft))
-        heard = sums[: self._pilot_chips]
+        pilot_sums = sums[: self._pilot_chips]
         points_px, sigma_px, flank_px, centre_px = self._find_points(
-            presence, placement, heard, aligned.corner_px
+            presence, placement, pilot_sums, aligned.corner_px
         )
-        sight = _NO_SIGHT
-        if self._is_column:
-            sight = line_of_sight(self._camera, points_px, sigma_px, attitude)
-        elif not self._camera.is_pinhole:
-            sight = LineOfSight(magnification=magnification_of(self._camera, points_px))
-        # Only of two images at one time it is asked; the pilot alone is kept for that, not the whole frame.
-        spread = LateSpread(heard.copy(), self._pilots, self._every, self._layout, self._pairs, placement)
+        # It is needed for two images at one time only; so the pilot alone is kept, not the whole frame.
+        spread = LateSpread(
+            pilot_sums.copy(), self._pilots, self._every, self._layout, self._pairs, placement
+        )
         image = points_px, sigma_px, flank_px, centre_px
-        return Reading(soft.symbols, given, distance, *image, sight, spread, flooded)
+        line = self._line_of_sight(points_px, sigma_px, attitude)
+        return FrameReading(soft.symbols, calibrated, distance, *image, line, spread, flooded)
+
+    def _line_of_sight(
+        self, points_px: NDArray[np.float64], sigma_px: NDArray[np.float64], attitude: Attitude | None
+    ) -> LineOfSight:
+        if self._is_column:
+            return line_of_sight(self._camera, points_px, sigma_px, attitude)
+        if self._camera.is_pinhole:
+            return _NO_LINE_OF_SIGHT
+        return LineOfSight(magnification=magnification_of(self._camera, points_px))
 
 
 class FrameDecoder:
-    """Decodes one frame after the other: aligns and reads it; it keeps no state of a stream.
+    """Aligns and reads one frame after the other; it keeps no state of a stream.
 
     Attributes:
-        aligner: Holds frames still.
-        steps: The link's roles.
+        aligner: Aligns frames.
+        steps: The link's algorithms.
     """
 
     def __init__(self, link: Link, announcer: Announcer | None = None) -> None:
@@ -331,28 +346,28 @@ class FrameDecoder:
         self._unknown = np.full(link.codebook.clusters, -1, np.int8)
         self._unknown.setflags(write=False)
 
-    def first_state(self) -> BarState:
-        """Before a transmitter's first frame."""
-        return BarState(None, -1, np.empty(0, np.int64), self.steps.distance_init())
+    def init_state(self) -> BarState:
+        """State before a transmitter's first frame."""
+        return BarState(None, -1, np.empty(0, np.int64), self.steps.init_distance())
 
     def decode(self, job: FrameJob, state: BarState) -> tuple[FrameResult, BarState] | None:
-        """Decode a frame of a known bar, see `read`; None where it takes more than its events to do so.
+        """Decode a frame of a known bar, see `read`; None where that takes more than the region's events.
 
-        It shows no bar, or not where the region has it, or no symbol: then it is to be looked at again with
-        what is around.
+        Such a frame shows no bar, or not where the region has it, or no symbol: it is to be decoded again
+        with what surrounds the region.
         """
         region, due = job.region, job.due
         aligned = self.aligner.align(region, due, state.pilot)
         if aligned is None:
             return None
-        shown = self.shown_place(aligned) if due.has_pilot else None
+        shown = self.locate_bar(aligned) if due.has_pilot else None
         # Within half of the seam, all events are there.
         if shown is not None and region.off_px(shown) > MARGIN_PX / 2:
             return None
         found, state = self.read(aligned, due, state, job.attitude, ranged=job.ranged)
-        return (found._replace(shown=shown), state) if found.given else None
+        return (found._replace(shown=shown), state) if found.is_readable else None
 
-    def shown_place(self, aligned: AlignedFrame) -> ShownPlace:
+    def locate_bar(self, aligned: AlignedFrame) -> ShownPlace:
         """Where a frame with a pilot shows its bar."""
         aligner, pilot = self.aligner, aligned.pilot
         box = aligner.box(aligned, pilot.placement)
@@ -369,27 +384,27 @@ class FrameDecoder:
         ranged: bool,
         known: bool = True,
     ) -> tuple[FrameResult, BarState]:
-        """Read an aligned frame, of a transmitter that is known or not; what it leaves for the next."""
-        reading = self._reader.read(aligned, due, self._before(state, due), attitude, ranged=ranged)
+        """Read an aligned frame, of a known transmitter or not; return it with the state for the next."""
+        reading = self._reader.read(aligned, due, self._last_chips(state, due), attitude, ranged=ranged)
         distance, filtered = state.distance, None
-        given = max(reading.soft.symbols.tolist()) >= 0
-        # What says nothing is no transmitter, and of one that is known its distance may still be of use.
-        given |= known and math.isfinite(reading.distance.distance_m)
-        if given:
-            distance, holds, filtered = self.steps.follow(
-                distance, due.start_us, due.lock.chip_us, reading.distance, reading.sight
+        is_readable = max(reading.soft.symbols.tolist()) >= 0
+        # The distance alone is of use only if the transmitter is known.
+        is_readable |= known and math.isfinite(reading.distance.distance_m)
+        if is_readable:
+            distance, holds, filtered = self.steps.track_distance(
+                distance, due.start_us, due.lock.chip_us, reading.distance, reading.line_of_sight
             )
             reading = reading._replace(distance=holds)
-        placed = aligned.pilot.placement
-        seen = max(sum(placed.seen.tolist()), 1)
+        placement = aligned.pilot.placement
+        seen = max(sum(placement.seen.tolist()), 1)
         state = BarState(aligned.pilot, due.number, reading.symbols, distance)
-        image = placed.cells / seen, seen, placed.mirrored
-        return FrameResult(reading, filtered, *image, given), state
+        image = placement.cells / seen, seen, placement.mirrored
+        return FrameResult(reading, filtered, *image, is_readable), state
 
-    def _before(self, state: BarState, due: DueFrame) -> NDArray[np.int8]:
+    def _last_chips(self, state: BarState, due: DueFrame) -> NDArray[np.int8]:
         """The chip that each cluster sent before a frame's info segment, int8 (K,); -1 if not known.
 
-        In a pair code it says nothing new, and is not looked up.
+        It does not matter to pair codes, and is not known there.
         """
         book = self._codebook
         if book.pairs:
@@ -402,38 +417,38 @@ class FrameDecoder:
         return np.where(symbols >= 0, book.codewords[symbols, -1].astype(np.int8), np.int8(-1))
 
 
-class Bars(Protocol):
-    """Decodes the frames of known bars, each by what its bar's earlier ones left; bars go by numbers.
+class BarDecoder(Protocol):
+    """Decodes the frames of bars, each by what its bar's earlier frames left; bars go by numbers.
 
-    After one that it cannot decode, a bar's frames are not, until its state is put there again.
+    After a frame that it cannot decode, none of the bar's is decoded until its state is put here again.
 
     Attributes:
-        at_once: Answers are known when they are asked for.
+        is_immediate: Results are known when frames are submitted.
     """
 
-    at_once: bool
+    is_immediate: bool
 
     def __len__(self) -> int:
-        """How many bars there are."""
+        """How many bars it decodes."""
         ...
 
-    def put(self, bar: int, state: BarState) -> None:
-        """Have a bar's frames decoded here from now on."""
+    def put_state(self, bar: int, state: BarState) -> None:
+        """Decode a bar's frames here from now on."""
         ...
 
-    def take(self, bar: int) -> BarState:
+    def take_state(self, bar: int) -> BarState:
         """Give a bar's state back: its frames are decoded elsewhere."""
         ...
 
     def decode(self, bar: int, job: FrameJob) -> Callable[[], FrameResult | None]:
-        """Have a bar's next frame decoded, see `FrameDecoder.decode`; gives what to call for the answer."""
+        """Decode a bar's next frame, see `FrameDecoder.decode`; return what fetches the result."""
         ...
 
 
-class BarDecoder:
-    """`Bars` that are decoded in this process."""
+class LocalBarDecoder:
+    """A `BarDecoder` in this process."""
 
-    at_once = True
+    is_immediate = True
 
     def __init__(self, decoder: FrameDecoder) -> None:
         self._decoder = decoder
@@ -443,17 +458,17 @@ class BarDecoder:
     def __len__(self) -> int:
         return len(self._states)
 
-    def put(self, bar: int, state: BarState) -> None:
-        """See `Bars`."""
+    def put_state(self, bar: int, state: BarState) -> None:
+        """See `BarDecoder`."""
         self._states[bar] = state
         self._stopped.discard(bar)
 
-    def take(self, bar: int) -> BarState:
-        """See `Bars`."""
+    def take_state(self, bar: int) -> BarState:
+        """See `BarDecoder`."""
         return self._states.pop(bar)
 
     def decode(self, bar: int, job: FrameJob) -> Callable[[], FrameResult | None]:
-        """See `Bars`."""
+        """See `BarDecoder`."""
         found = None if bar in self._stopped else self._decoder.decode(job, self._states[bar])
         if found is None:
             self._stopped.add(bar)
@@ -463,22 +478,22 @@ class BarDecoder:
 
 
 def calibrate_llr(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:
-    """A frame as a decoding read it, with what can be believed.
+    """Calibrate the LLRs of a decoded frame, and keep the symbols that are sure.
 
-    Decoders are surer than they are right, or less, each in its own way: pixels share light and motion.
-    Log-likelihood ratios that tell the truth have a variance of twice their mean, whatever the channel, if it
-    is near Gaussian: those of a cluster are scaled so that they do, by its own scatter, that of its frame,
-    and what is likely. What these are worth lies between what fits 20 000 symbols of `motion-feedback` in
-    recordings and in the harder scenes of `examples/campaigns/road.toml`, and what fits a Gaussian channel;
-    both are met within a factor of 2 where less than half of the frames are wrong. The nearest rival of a
-    symbol, at its least LLR, says how likely it is right; rather wrong ones are not given. `quality` is the
-    probability that all that are given are right, of errors that come together.
+    Decoders are surer than they are right, or less, each in its own way: pixels share light and motion. The
+    variance of true log-likelihood ratios is twice their mean, whatever the channel, if it is near Gaussian:
+    those of a cluster are scaled so, by their own scatter, that of the frame, and an expected one. The
+    weights of these lie between what fits 20 000 symbols of `motion-feedback` in recordings and in the harder
+    scenes of `examples/campaigns/road.toml`, and what fits a Gaussian channel; both are met within a factor
+    of 2 where less than half of the frames are wrong. The nearest rival of a symbol, at its least LLR, gives
+    the probability that the symbol is right; those that are rather wrong are not given. `quality` is the
+    probability that all given ones are right, as errors come together.
 
     Args:
-        soft: What a decoding says.
-        seen: Clusters that are in sight, bool (K,); nothing is given of the others, and their LLRs are 0.
+        soft: As decoded.
+        seen: Clusters that are in sight, bool (K,); the others get no symbol and LLRs of 0.
     """
     symbols, llr = np.empty_like(soft.symbols), np.empty_like(soft.llr)
-    expected, sure = (_FRAME_WORTH, _EXPECTED_WORTH, _EXPECTED_SPREAD), (_LEAST_SURE, _TOGETHER)
+    expected, sure = (_FRAME_WORTH, _EXPECTED_WORTH, _EXPECTED_SPREAD), (_MIN_PROBABILITY, _ERRORS_TOGETHER)
     quality = _kernels.calibrate_llr(soft.symbols, soft.llr, seen, expected, sure, symbols, llr)
     return SoftSymbols(symbols, llr, quality)

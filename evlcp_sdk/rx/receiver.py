@@ -13,7 +13,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
 from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx.detected import DetectedRegions
-from evlcp_sdk.rx.framer import Announcer, Framer, StreamContext, on_camera
+from evlcp_sdk.rx.framer import Announcer, Framer, StreamContext, to_camera_time
 from evlcp_sdk.rx.framing import PacketFraming
 from evlcp_sdk.rx.guard import tracker_of
 from evlcp_sdk.rx.inbox import MessageAssembler
@@ -97,8 +97,8 @@ class Receiver:
             announcer = Announcer(hook.evlcp_stage_finished, clock.camera_us)
         self._workers = Workers.beside(links, workers, announced=announcer is not None)
         known = attitude_source(attitude), clock_zero
-        bars = None if self._workers is None else self._workers.bars
-        stream = StreamContext(clock, *known, announcer, limits, bars=bars)
+        bar_decoders = None if self._workers is None else self._workers.bars
+        stream = StreamContext(clock, *known, announcer, limits, bar_decoders=bar_decoders)
         self._early = EarlyFrames(on_frame)
         self._several: SeveralLinks | None = None
         if len(links) == 1:
@@ -119,7 +119,7 @@ class Receiver:
 
         Starts of the first and the last frame that was due while it was, given or not, camera clock, us.
         """
-        return {number: lit for one in self._receivers for number, lit in one.framing.lit.items()}
+        return {number: lit for one in self._receivers for number, lit in one.framing.light_spans_us.items()}
 
     @property
     def regions(self) -> tuple[Region, ...]:
@@ -208,7 +208,7 @@ class Receiver:
         """Give each link a time step; give the packets that are complete, of the links that fit."""
         if not step.whole:
             for one in self._receivers:
-                one.framing.ahead(step)
+                one.framing.decode_early(step)
             return []
         several = self._several
         if several is None:
@@ -290,7 +290,7 @@ class LinkReceiver:
     @property
     def regions(self) -> list[Region]:
         """Where the regions that are followed were seen last, on the camera's clock."""
-        return [on_camera(one.latest, self._clock.camera_us) for one in self._regions.alive]
+        return [to_camera_time(one.latest, self._clock.camera_us) for one in self._regions.alive]
 
     @property
     def places(self) -> dict[int, Region]:
@@ -303,8 +303,8 @@ class LinkReceiver:
         """What was found so far, and dropped."""
         messages = self._messages.counts if self._messages is not None else {}
         found = self._regions.counts | self.framing.counts
-        found["frames"] -= self._queue.cut
-        found["frames_at_end"] = self._queue.cut
+        found["frames"] -= self._queue.frames_cut
+        found["frames_at_end"] = self._queue.frames_cut
         if self.name:
             found["frames"] -= self._of_others
             found["frames_of_others"] = self._of_others + self._rejected_of_others
@@ -326,12 +326,12 @@ class LinkReceiver:
         if taken:
             self._leave(taken, owning)
         if self._announcer is not None:
-            self._announcer.start()
-        self.framing.catch_up(step.start_us)
+            self._announcer.start_clock()
+        self.framing.apply_pending(step.start_us)
         regions = self._regions.step(step.start_us, step.events, taken)
         if self._announcer is not None:
             for region in regions:
-                self._announcer.lap("regions", region.latest)
+                self._announcer.announce("regions", region.latest)
         self.framing.step(regions, step)
         return self._queue.step()
 
@@ -342,12 +342,12 @@ class LinkReceiver:
                 continue
             if any(same_place(region.latest, place) for place in taken):
                 self._regions.drop(region)
-                self.framing.let_go(region)
+                self.framing.forget_region(region)
 
     def end_at(self, end_us: float) -> None:
         """Let the stream end at a time, us: frames that are cut by it are not given."""
-        if self.framing.cut_by_the_end:
-            self._queue.ends_us = end_us
+        if self.framing.drops_cut_frames:
+            self._queue.stream_end_us = end_us
 
     def finish(self) -> list[Packet]:
         """End the stream's events; give the packets that were still incomplete."""
@@ -359,28 +359,28 @@ class LinkReceiver:
         read = []
         for packet in packets:
             self._given["packets"] += 1
-            alike = packet.echo_of is None and self._queue.reflections.alike(packet.transmitter)
+            alike = packet.echo_of is None and self._queue.reflections.has_twin(packet.transmitter)
             self._given["frames_alike"] += len(packet.frames) * alike
             self._given["frames_reflected"] += len(packet.frames) * (packet.echo_of is not None)
             packet = replace_fields(packet, t_us=self._clock.camera_us(packet.t_us))
             if self._announcer is not None:
-                self._announcer.start()
+                self._announcer.start_clock()
             if self._messages is not None:
                 packet = self._messages.add(packet)
             if self._announcer is not None:
                 for message in packet.messages:
-                    self._announcer.lap("message", message)
+                    self._announcer.announce("message", message)
             read.append(packet)
         return read
 
     def refuse(self, packet: Packet) -> None:
         """Count a packet that another link fits better."""
         self._of_others += len(packet.frames)
-        self._rejected_of_others += self.framing.discard(number=packet.transmitter)
+        self._rejected_of_others += self.framing.discard_misses(number=packet.transmitter)
 
     def discard_place(self, place: Region) -> None:
         """Count frames that were rejected in another link's place apart from those that no link reads."""
-        self._rejected_of_others += self.framing.discard(place=place)
+        self._rejected_of_others += self.framing.discard_misses(place=place)
 
     def close(self) -> None:
         """End the stream: what messages still lack is missing."""

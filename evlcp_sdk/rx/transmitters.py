@@ -1,7 +1,7 @@
-"""Transmitters: what is known of each region that sends, and where its frames stand on the clock.
+"""Transmitters: what is known of each region that sends, and when its frames are due.
 
-One is numbered at its first frame, and remembered when lost from sight. Its frames stand on a grid of
-packets, which a lock sets. Its rows come late: a sensor reads them one after another, 0.1 to 0.35 us each,
+A transmitter is numbered at its first frame, and remembered when lost from sight. Its frames are on a grid of
+packets, which a lock sets. Its rows are delayed: a sensor reads them one after another, 0.1 to 0.35 us each,
 those without an event in no time. All clusters of a bar change together at the preamble's edges, as they do
 in the middle of every value, so that its rows wait for one another: 20 us from end to end at 50 m, 90 us at
 16 m.
@@ -21,8 +21,8 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import DueFrame
 from evlcp_sdk.rx.limits import Limits
-from evlcp_sdk.rx.reading import Bars, BarState
-from evlcp_sdk.rx.reflections import LONGEST_ROW_US, PacketAssembler
+from evlcp_sdk.rx.reading import BarDecoder, BarState
+from evlcp_sdk.rx.reflections import MAX_ROW_US, PacketAssembler
 from evlcp_sdk.rx.regions import Followed, Places
 from evlcp_sdk.values import Events, SyncLock, replace_fields
 
@@ -30,35 +30,36 @@ LOOKBACK_PACKETS = 2
 """Packets of events kept while there is no lock: one to find a preamble in, one to look back on."""
 
 _REMEMBER_US = 1e6
-"""How long a transmitter lost from sight is remembered: clocks 100 ppm apart drift by a chip in it."""
+"""How long a transmitter lost from sight is remembered: clocks 100 ppm apart drift by a chip meanwhile."""
 
 _UNSEEN_STEPS = 5
 """Steps without a position after which a region counts as lost: it blinks in every chip otherwise."""
 
-_STEPS = 10
-"""Steps of a chip in which the response of a block of rows is placed."""
+_CHIP_STEPS = 10
+"""Steps of a chip in which the response of a block of rows is measured."""
 
 _BLOCK_PX = 8
-"""Rows that are looked at together: hundreds of events in a preamble, read within 2 us."""
+"""Rows of a block: they have hundreds of events in a preamble, and are read within 2 us."""
 
-_FEWEST_BLOCKS = 4
-"""Blocks below which a bar is too small to tell, and for a delay by row to matter."""
+_MIN_BLOCKS = 4
+"""Blocks below which a bar is too small to measure a delay by row, or for it to matter."""
 
-_TYPICAL_US = 0.2
-"""Time a row takes (sigma) before one has been measured."""
+_TYPICAL_ROW_US = 0.2
+"""Time a row takes (sigma) before it has been measured."""
 
-_WALK_US = 0.01
-"""Change of it from packet to packet: with the number of events in a row, as the bar grows."""
+_ROW_WALK_US = 0.01
+"""Change of that from packet to packet: it grows with the events in a row, as the bar does."""
 
 _CHANCE_SIGMAS = 4.0
-"""Sigmas (the root of the number of events) that a block must fit the preamble by."""
+"""Sigmas (the root of the number of events) by which a block has to fit the preamble."""
 
 _PLACE_SIGMA_US = 2.0
-"""Least error of a block's place, from the steps."""
+"""Least error of a block's delay, from the steps."""
 
-_NEAR, _OFF_CHIPS = 0.5, 0.25
-"""How near to one another in a chip events come, 0 to 1, that say when; and how far off its middle they may
-be. Of a bar in bright light they are so by 0.6 to 0.8, and off by an eighth; in the dim they fill chips."""
+_MIN_COHERENCE, _MAX_OFFSET_CHIPS = 0.5, 0.25
+"""How near to one another in a chip events come, 0 to 1, for their time to be known; and how far off its
+middle they may be. In bright light they are so by 0.6 to 0.8, and off by an eighth; in the dim they fill
+chips."""
 
 
 @dataclass
@@ -71,7 +72,7 @@ class PacketGrid:
         lock: The newest lock; None before the first.
         packet: Number of the lock's packet, counted from the first that may have a frame here.
         frame: Next frame to decode, counted from the first of packet 0.
-        next: What is known of it; None before the first lock.
+        next: When it is due; None before the first lock.
     """
 
     format: PacketFormat
@@ -81,26 +82,26 @@ class PacketGrid:
     frame: int = 0
     next: DueFrame | None = None
 
-    def follow(self, lock: SyncLock) -> bool:
-        """Take a lock, frames going on where they are; False, and nothing taken, where it is off the grid."""
+    def accept_lock(self, lock: SyncLock) -> bool:
+        """Accept a lock on the grid, and go on with the same frame; False for a lock off the grid."""
         if self.lock is None:
             return False
-        apart = (lock.packet_t_us - self.lock.packet_t_us) / (self.format.packet_chips * lock.chip_us)
-        if abs(apart - round(apart)) * self.format.packet_chips >= 1:
+        packets = (lock.packet_t_us - self.lock.packet_t_us) / (self.format.packet_chips * lock.chip_us)
+        if abs(packets - round(packets)) * self.format.packet_chips >= 1:
             return False
-        self.packet += round(apart)
+        self.packet += round(packets)
         self.lock = lock
         self.go_to(self.frame)
         return True
 
     def restart(self, lock: SyncLock, earliest_us: float) -> None:
-        """Take a lock whatever was before; frames are numbered from the first whole one's packet on."""
+        """Begin a new grid by a lock; frames count from the packet of the first one that is complete."""
         back = math.ceil((lock.packet_t_us - earliest_us) / (self.format.packet_chips * lock.chip_us))
         self.lock, self.packet, self.frame = lock, back, 0
         self.skip_before(earliest_us)
 
     def skip_before(self, earliest_us: float) -> int:
-        """Pass over the frames that start before a time; how many."""
+        """Skip the frames that start before a time; return how many."""
         first = frame = self.frame
         while self.start_us(frame) < earliest_us:
             frame += 1
@@ -116,7 +117,7 @@ class PacketGrid:
         return lock.packet_t_us + chips * lock.chip_us
 
     def go_to(self, frame: int) -> None:
-        """Another frame is the next one, or it stands at another time."""
+        """Set the next frame, and its times by the newest lock."""
         lock, form = self.lock, self.format
         assert lock is not None
         self.frame, start_us = frame, self.start_us(frame)
@@ -138,15 +139,15 @@ class PacketGrid:
             middle_us=float(start_us) + min(end - begin, form.pilot_chips) // 2 * float(lock.chip_us),
         )
 
-    def due(self, until_us: float) -> DueFrame | None:
-        """The next frame, if it lies before a time with all that is read with it."""
+    def next_due(self, until_us: float) -> DueFrame | None:
+        """The next frame, if all that is read with it lies before a time."""
         known = self.next
         return known if known is not None and known.read_us <= until_us else None
 
 
 @dataclass(frozen=True)
 class RowDelay:
-    """What is known of a bar's rows.
+    """Delay of a bar's rows.
 
     Attributes:
         row_us: How much later a row's events come than those of the row above, us.
@@ -154,16 +155,16 @@ class RowDelay:
     """
 
     row_us: float = 0.0
-    variance: float = _TYPICAL_US**2
+    variance: float = _TYPICAL_ROW_US**2
 
-    def measured(self, row_us: float, sigma_us: float) -> "RowDelay":
-        """Take a packet's measurement, as a Kalman filter does."""
-        variance = self.variance + _WALK_US**2
+    def update(self, row_us: float, sigma_us: float) -> "RowDelay":
+        """Update by a packet's measurement, as a Kalman filter does."""
+        variance = self.variance + _ROW_WALK_US**2
         gain = variance / (variance + sigma_us**2)
         return RowDelay(self.row_us + gain * (row_us - self.row_us), (1 - gain) * variance)
 
-    def delayed(self, lock: SyncLock, height_px: float) -> SyncLock:
-        """A lock with this delay, of a bar of some height."""
+    def apply_to(self, lock: SyncLock, height_px: float) -> SyncLock:
+        """A lock with this delay, for a bar of this height."""
         return replace_fields(lock, row_us=self.row_us, last_row_us=abs(self.row_us) * height_px / 2)
 
 
@@ -177,30 +178,31 @@ def measure_row_delay(
     """Delay from one row to the next in a preamble, and its sigma, us; NaN where too few rows show it.
 
     `chips` are those of the preamble, -1 and +1, float64 (P,); its events are among the `pieces` of the
-    region, (start us, events) a time step. The bar's centre lies in row `centre_px`.
+    region, (start us, events) a time step. The bar's centre is in row `centre_px`.
     """
     blocks = round(height_px / _BLOCK_PX)
-    if blocks < _FEWEST_BLOCKS:
+    if blocks < _MIN_BLOCKS:
         return math.nan, math.nan
-    reach = _STEPS + _STEPS // 2
-    step_us = float(lock.chip_us) / _STEPS
+    reach = _CHIP_STEPS + _CHIP_STEPS // 2
+    step_us = float(lock.chip_us) / _CHIP_STEPS
     top_px = centre_px - (height_px - 1) / 2 - 0.5
     start_us = np.array([lock.delay_off_us, lock.delay_on_us]) + lock.packet_t_us - reach * step_us
-    counts = np.zeros((2, blocks, len(chips) * _STEPS + 2 * reach))
+    counts = np.zeros((2, blocks, len(chips) * _CHIP_STEPS + 2 * reach))
     first_us, last_us = float(start_us.min()), float(start_us.max()) + counts.shape[2] * step_us
     for begin_us, e in pieces:
         if begin_us < last_us and e.t_us.size and e.t_us[-1] >= first_us:
             _kernels.count_rows(e.t_us, e.y, e.p, start_us, step_us, top_px, height_px / blocks, counts)
     rows_px = (np.arange(blocks) + 0.5) * height_px / blocks
-    limits = _FEWEST_BLOCKS, _CHANCE_SIGMAS, _PLACE_SIGMA_US / step_us
-    return _kernels.fit_row_delay(counts, chips, _STEPS, step_us, rows_px, limits)
+    limits = _MIN_BLOCKS, _CHANCE_SIGMAS, _PLACE_SIGMA_US / step_us
+    return _kernels.fit_row_delay(counts, chips, _CHIP_STEPS, step_us, rows_px, limits)
 
 
-def retime(lock: SyncLock, start_us: float, pieces: Iterable[tuple[int, Events]]) -> SyncLock:
-    """A lock by when in a chip a region's events come from a time on; the same where they come in none.
+def retime_lock(lock: SyncLock, start_us: float, pieces: Iterable[tuple[int, Events]]) -> SyncLock:
+    """Correct a lock by when in a chip a region's events come from a time on.
 
-    Where they are near one another, in bright light, they are in the middle of a chip; where they are off it,
-    light or readout were slower before, and they come sooner now.
+    In bright light events come close together in the middle of a chip; where they are off it, light or
+    readout were slower before, and events come sooner now. A lock whose events are spread or in the middle is
+    returned as it is.
     """
     turn, total = 0j, 0
     for _, e in pieces:
@@ -209,7 +211,7 @@ def retime(lock: SyncLock, start_us: float, pieces: Iterable[tuple[int, Events]]
         turn += complex(np.exp(2j * math.pi * (chips - 0.5)).sum())
         total += t_us.size
     late = cmath.phase(turn) / (2 * math.pi)
-    if abs(turn) < _NEAR * total or abs(late) <= _OFF_CHIPS:
+    if abs(turn) < _MIN_COHERENCE * total or abs(late) <= _MAX_OFFSET_CHIPS:
         return lock
     late_us = (late - 1 if late > 0 else late) * lock.chip_us
     return replace_fields(
@@ -225,57 +227,57 @@ class Transmitter:
         region: Where it is in the image, and its events.
         sync: State of its synchronization.
         state: What its frames left for the next, unless a decoder has it.
-        packets: Collects its frames.
-        grid: Where its frames stand on the clock.
+        assembler: Collects its frames.
+        grid: When its frames are due.
         number: Transmitter number, None before the first frame.
-        first: Number of the first packet on the grid that had a frame, None before.
-        rows: How late the rows of its bar are read.
-        given: Number of the newest frame on the grid that was given before any was rejected since the
-            newest preamble on it.
-        doubtful: Frames since the first that was rejected since then, by what they count as: maybe another
-            transmitter sends.
-        missed: Frames due that were not given, by the count that they belong to.
-        behind: Frames that are due wait for the next step.
-        tried: Number of the newest frame on the grid that was not given as soon as it was due.
-        lit_us: When the first frame was due in which its light was there, camera clock, us; None before.
-        step_events: How many of its events were in the time step in which its lock came.
+        first_packet: Number of the first packet on the grid that had a frame, None before.
+        row_delay: Of its bar.
+        last_confirmed: Number of the newest frame on the grid before any was rejected since the newest
+            preamble on it.
+        unconfirmed: Frames since the first that was rejected since then, by count: another transmitter may
+            send.
+        missed: Frames that were due and skipped, by count.
+        is_behind: Frames that are due wait for the next step.
+        last_tried: Number of the newest frame on the grid that was skipped as soon as it was due.
+        first_lit_us: When the first frame with its light was due, camera clock, us; None before.
+        step_events: Its events in the time step of its lock.
         strayed: Its newest frame was not found, or not where its region was.
-        decoder: Who does so, and has its state.
+        decoder: Decodes its frames and has its state; None while that is here.
     """
 
     region: Followed
     sync: Any
     state: BarState
-    packets: PacketAssembler
+    assembler: PacketAssembler
     grid: PacketGrid
     number: int | None = None
-    first: int | None = None
-    rows: RowDelay = field(default_factory=RowDelay)
-    given: int = -1
-    doubtful: Counter[str] = field(default_factory=Counter)
+    first_packet: int | None = None
+    row_delay: RowDelay = field(default_factory=RowDelay)
+    last_confirmed: int = -1
+    unconfirmed: Counter[str] = field(default_factory=Counter)
     missed: Counter[str] = field(default_factory=Counter)
-    behind: bool = False
-    tried: int = -1
-    lit_us: float | None = None
+    is_behind: bool = False
+    last_tried: int = -1
+    first_lit_us: float | None = None
     step_events: int = 0
     strayed: bool = True
-    decoder: Bars | None = None
+    decoder: BarDecoder | None = None
 
     def fetch_state(self) -> BarState:
-        """Its state, taken from where its frames were decoded."""
+        """Fetch the state back from the decoder, if one has it."""
         if self.decoder is not None:
             assert self.number is not None
-            self.state, self.decoder = self.decoder.take(self.number), None
+            self.state, self.decoder = self.decoder.take_state(self.number), None
         return self.state
 
-    def settle(self) -> None:
-        """Take a preamble on the grid: the frames before it are its own."""
-        self.given, self.doubtful = max(self.given, self.grid.frame - 1), Counter()
-        self.packets.in_doubt = False
+    def confirm_frames(self) -> None:
+        """Confirm all frames before a preamble on the grid."""
+        self.last_confirmed, self.unconfirmed = max(self.last_confirmed, self.grid.frame - 1), Counter()
+        self.assembler.unconfirmed = False
 
 
 class Transmitters:
-    """Regions with what is known of them; those in sight are `alive`, by the number of their region."""
+    """The regions with what is known of them; those in sight are `alive`, by the number of their region."""
 
     def __init__(
         self,
@@ -288,91 +290,91 @@ class Transmitters:
         self._packet = packet
         self._lookback_us = LOOKBACK_PACKETS * packet.packet_chips * packet.chip_us
         self._chips_after = chips_after
-        self._remembered = limits.remembered
+        self._max_remembered = limits.remembered
         self._step_us = step_us
         self.alive: dict[int, Transmitter] = {}
         self._released: list[Transmitter] = []
         self._numbers = numbers
 
     def open(self, region: Followed, sync: Any, state: BarState) -> Transmitter:
-        """Take a new region, with the first states of its synchronization and its frames."""
-        packets, grid = PacketAssembler(self._packet.frames), self._grid()
-        transmitter = Transmitter(region, sync, state, packets, grid)
+        """Add a new region, with the first states of its synchronization and its frames."""
+        assembler = PacketAssembler(self._packet.frames)
+        transmitter = Transmitter(region, sync, state, assembler, self._new_grid())
         self.alive[region.id] = transmitter
         return transmitter
 
-    def adopt(self, transmitter: Transmitter, lock: SyncLock) -> None:
-        """Take a lock that is off the grid; frames start with the first whole one of the region's events."""
+    def restart_grid(self, transmitter: Transmitter, lock: SyncLock) -> None:
+        """Begin a new grid by a lock; frames start with the first complete one of the region's events."""
         region, grid = transmitter.region, transmitter.grid
         transmitter.state = transmitter.fetch_state()._replace(pilot=None)
         # Half a chip before the first event, at 0, is still within the first edge's delay.
         earliest_us = max(region.first_us, -lock.chip_us / 2)
-        if grid.lock is None and self._inherit(transmitter, lock):
+        if grid.lock is None and self._resume_lost(transmitter, lock):
             transmitter.grid.skip_before(earliest_us)
             return
         if grid.lock is not None:
             earliest_us = max(earliest_us, grid.start_us(grid.frame))
         grid.restart(lock, earliest_us)
 
-    def succeed(self, old: Transmitter) -> Transmitter:
-        """Another transmitter in a region, after the last frame that is surely of the one before."""
+    def replace(self, old: Transmitter) -> Transmitter:
+        """Begin another transmitter in a region, after the last confirmed frame of the old one."""
         region = old.region
         oldest_us = region.pieces[0][0] if region.pieces else 0
-        region.first_us = max(region.first_us, oldest_us, int(old.grid.start_us(old.given + 1)))
-        # The same LEDs, as far as one knows: where the bar is does not begin anew.
+        region.first_us = max(region.first_us, oldest_us, int(old.grid.start_us(old.last_confirmed + 1)))
+        # The LEDs may be the same: the place of the bar and its distance go on.
         new = self.open(region, old.sync, old.fetch_state()._replace(frame=-1, pilot=None))
-        new.rows = old.rows
+        new.row_delay = old.row_delay
         return new
 
-    def number(self, transmitter: Transmitter) -> int:
-        """Its number: the next one, if it has none."""
+    def assign_number(self, transmitter: Transmitter) -> None:
+        """Give a transmitter the next number, unless it has one."""
         if transmitter.number is None:
             transmitter.number = next(self._numbers)
-        return transmitter.number
 
-    def _inherit(self, transmitter: Transmitter, lock: SyncLock) -> bool:
-        """Go on as a transmitter that was lost from sight, if the packets stand on its grid."""
+    def _resume_lost(self, transmitter: Transmitter, lock: SyncLock) -> bool:
+        """Resume a transmitter that was lost from sight, if the packets are on its grid."""
         for lost in [*self.alive.values(), *self._released]:
             unseen_us = lock.packet_t_us - lost.region.latest.t_us
             if lost is transmitter or not 0 < unseen_us < _REMEMBER_US:
                 continue
-            if unseen_us < _UNSEEN_STEPS * self._step_us or not lost.grid.follow(lock):
+            if unseen_us < _UNSEEN_STEPS * self._step_us or not lost.grid.accept_lock(lock):
                 continue
-            transmitter.number, transmitter.first = lost.number, lost.first
+            transmitter.number, transmitter.first_packet = lost.number, lost.first_packet
             transmitter.state = transmitter.state._replace(distance=lost.fetch_state().distance)
-            transmitter.given = lost.given
-            lost.number, lost.first, lost.given = None, None, -1
-            transmitter.packets, lost.packets = lost.packets, transmitter.packets
-            transmitter.grid, lost.grid = lost.grid, self._grid()
-            transmitter.settle()
+            transmitter.last_confirmed = lost.last_confirmed
+            lost.number, lost.first_packet, lost.last_confirmed = None, None, -1
+            transmitter.assembler, lost.assembler = lost.assembler, transmitter.assembler
+            transmitter.grid, lost.grid = lost.grid, self._new_grid()
+            transmitter.confirm_frames()
             return True
         return False
 
-    def _grid(self) -> PacketGrid:
+    def _new_grid(self) -> PacketGrid:
         return PacketGrid(self._packet, self._chips_after)
 
-    def in_step(self, transmitter: Transmitter) -> list[Transmitter]:
-        """Others that have shown no frame yet either, whose packets stand on the same times.
+    def find_in_step(self, transmitter: Transmitter) -> list[Transmitter]:
+        """Find others without a frame so far whose packets are at the found times.
 
-        They are parts of one bar, or a bar and its image: of two bars, three in a hundred pairs would.
+        They are parts of one bar, or a bar and its image: of two bars, three in a hundred pairs would be in
+        step.
         """
         lock = transmitter.grid.lock
         if lock is None or transmitter.region.size_px is not None:
             return []
-        period_us, same = self._packet.packet_chips * lock.chip_us, []
+        period_us, found = self._packet.packet_chips * lock.chip_us, []
         for other in self.alive.values():
-            heard = other.grid.lock
-            if other is transmitter or heard is None or other.region.size_px is not None:
+            other_lock = other.grid.lock
+            if other is transmitter or other_lock is None or other.region.size_px is not None:
                 continue
-            apart = (heard.packet_t_us - lock.packet_t_us) / period_us
+            packets = (other_lock.packet_t_us - lock.packet_t_us) / period_us
             rows_px = abs(other.region.latest.y_px - transmitter.region.latest.y_px)
-            within_us = lock.chip_us / 4 + LONGEST_ROW_US * rows_px
-            if abs(apart - round(apart)) * period_us <= within_us:
-                same.append(other)
-        return same
+            within_us = lock.chip_us / 4 + MAX_ROW_US * rows_px
+            if abs(packets - round(packets)) * period_us <= within_us:
+                found.append(other)
+        return found
 
-    def forget(self, transmitter: Transmitter, due: DueFrame | None, now_us: float) -> None:
-        """Drop the events that no frame can need any more: the next one is `due`, if one is."""
+    def drop_old_events(self, transmitter: Transmitter, due: DueFrame | None, now_us: float) -> None:
+        """Drop the events that no frame needs any more; the next one is `due`, if one is."""
         region = transmitter.region
         oldest_us = now_us - self._lookback_us
         if due is None:
@@ -384,10 +386,12 @@ class Transmitters:
             keep_us = due.start_us - due.lock.chip_us
             if due.index == 0:
                 keep_us -= self._packet.preamble_chips * due.lock.chip_us
-            if transmitter.number is not None and due.number > transmitter.given + 1:
-                # They may be another's that has begun here, which its second preamble tells when it is over.
+            if transmitter.number is not None and due.number > transmitter.last_confirmed + 1:
+                # Another transmitter may have begun here, which is known after its second preamble.
                 oldest_us -= 2 * self._packet.preamble_chips * due.lock.chip_us
-                keep_us = min(keep_us, max(transmitter.grid.start_us(transmitter.given + 1), oldest_us))
+                keep_us = min(
+                    keep_us, max(transmitter.grid.start_us(transmitter.last_confirmed + 1), oldest_us)
+                )
         region.forget_before(keep_us, self._step_us, min(keep_us, oldest_us))
 
     def release(self, transmitter: Transmitter) -> None:
@@ -398,11 +402,11 @@ class Transmitters:
         region.positions = Places([region.latest])
         transmitter.sync, transmitter.state = None, transmitter.fetch_state()._replace(pilot=None)
         oldest_us = region.latest.t_us - _REMEMBER_US
-        kept = [r for r in self._released if r.region.latest.t_us > oldest_us]
-        self._released = [*kept, transmitter][-self._remembered :]
+        kept = [one for one in self._released if one.region.latest.t_us > oldest_us]
+        self._released = [*kept, transmitter][-self._max_remembered :]
 
     def close(self) -> list[Transmitter]:
-        """Give those that are alive, and forget all."""
+        """Forget all transmitters; return those that are alive."""
         alive = list(self.alive.values())
         self.alive, self._released = {}, []
         return alive

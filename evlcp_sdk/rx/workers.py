@@ -27,7 +27,7 @@ from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import DueFrame
 from evlcp_sdk.rx.placement import layout_of
-from evlcp_sdk.rx.reading import BarDecoder, BarState, FrameDecoder, FrameJob, FrameResult
+from evlcp_sdk.rx.reading import BarDecoder, BarState, FrameDecoder, FrameJob, FrameResult, LocalBarDecoder
 from evlcp_sdk.rx.regions import EVENT_BYTES, Followed, Places
 from evlcp_sdk.values import Events, Region, SyncLock
 
@@ -218,9 +218,9 @@ class _Worker:
 
 
 class _WorkerBars:
-    """`Bars` of one link that a worker decodes."""
+    """`BarDecoder` of one link that a worker decodes."""
 
-    at_once = False
+    is_immediate = False
 
     def __init__(self, worker: _Worker, link: str, step_us: int) -> None:
         self._worker, self._link, self._step_us = worker, link, step_us
@@ -229,19 +229,19 @@ class _WorkerBars:
     def __len__(self) -> int:
         return len(self._bars)
 
-    def put(self, bar: int, state: BarState) -> None:
-        """See `Bars`."""
+    def put_state(self, bar: int, state: BarState) -> None:
+        """See `BarDecoder`."""
         self._bars.add(bar)
         self._worker.send("put", self._link, bar, state)
 
-    def take(self, bar: int) -> BarState:
-        """See `Bars`."""
+    def take_state(self, bar: int) -> BarState:
+        """See `BarDecoder`."""
         self._bars.remove(bar)
         state: BarState = self._worker.ask("take", self._link, bar, None)()
         return state
 
     def decode(self, bar: int, job: FrameJob) -> Callable[[], FrameResult | None]:
-        """See `Bars`."""
+        """See `BarDecoder`."""
         region, due = job.region, job.due
         pieces, room = self._worker.placed(region.pieces_between(due.start_us, due.read_us, self._step_us))
         bare = Followed(region.id, region.positions, region.first_us, size_px=region.size_px)
@@ -281,7 +281,7 @@ def _work(pipe: Connection, memory: Any, links: Mapping[str, Link]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     shared, ready = np.frombuffer(memory, np.uint8), _watched(pipe)
     try:
-        bars = {name: BarDecoder(FrameDecoder(link)) for name, link in links.items()}
+        bars = {name: LocalBarDecoder(FrameDecoder(link)) for name, link in links.items()}
         for link in links.values():
             load_kernels(link)
         pipe.send(None)
@@ -289,9 +289,9 @@ def _work(pipe: Connection, memory: Any, links: Mapping[str, Link]) -> None:
             _poll(ready, None)
             kind, name, bar, given = pipe.recv()
             if kind == "put":
-                bars[name].put(bar, given)
+                bars[name].put_state(bar, given)
             elif kind == "take":
-                pipe.send(bars[name].take(bar))
+                pipe.send(bars[name].take_state(bar))
             else:
                 job, pieces = given
                 pipe.send(_decode(bars[name], bar, job, pieces, shared))
@@ -347,14 +347,14 @@ def load_kernels(link: Link) -> None:
     order = np.argsort(t_us, axis=None)
     events = Events.of(*(column.ravel()[order].astype(np.int64) for column in columns))
     decoder = FrameDecoder(link)
-    bars = BarDecoder(decoder)
+    bars = LocalBarDecoder(decoder)
     for some in (events, events[rng.random(len(events)) < _FEW]):
         region = Followed(
             0, Places([Region(0, t, middle.real, middle.imag, *ends) for t in (0.0, due.end_us)]), 0
         )
         region.size_px = ends
         region.add(0, some)
-        bars.put(0, decoder.first_state())
+        bars.put_state(0, decoder.init_state())
         # An algorithm that fails here and with no frame of a camera is no matter.
         with suppress(PluginError):
             _measure_spread(bars.decode(0, FrameJob(region, due, None, ranged=True))())

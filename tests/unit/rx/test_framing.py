@@ -42,7 +42,7 @@ def lock_of(form, packet, late_us=0.0, delay_us=-20.0):
 
 def due_until(grid, until_us):
     found = []
-    while (due := grid.due(until_us)) is not None:
+    while (due := grid.next_due(until_us)) is not None:
         grid.go_to(due.number + 1)
         found.append(due)
     return found
@@ -77,8 +77,8 @@ def test_the_events_after_the_last_edge_are_waited_for(form, after):
     grid.restart(lock_of(form, 0, delay_us=35.0), ZERO_US)
     _, _, start_us, end_us = on_air(form, 1)[0]
     read_us = end_us + 35 + after * CHIP_US
-    assert grid.due(read_us - 1) is None
-    due = grid.due(read_us + 1)
+    assert grid.next_due(read_us - 1) is None
+    due = grid.next_due(read_us + 1)
     assert due is grid.next
     assert (due.start_us, due.end_us, due.read_us) == pytest.approx((start_us, end_us + 35, read_us))
 
@@ -88,12 +88,12 @@ def test_the_events_after_the_last_edge_are_waited_for(form, after):
 def test_a_lock_near_the_grid_moves_it_and_another_begins_anew(form, late_us):
     """A lock off the grid begins another."""
     grid, lock = PacketGrid(form), lock_of(form, 3, late_us)
-    assert not grid.follow(lock)
+    assert not grid.accept_lock(lock)
     grid.restart(lock_of(form, 0), ZERO_US)
     done = due_until(grid, on_air(form, 1)[-1][3] + 1)
     before_us = grid.start_us(grid.frame)
     near = abs(late_us) < CHIP_US
-    assert grid.follow(lock) == near
+    assert grid.accept_lock(lock) == near
     if not near:
         assert grid.start_us(grid.frame) == before_us
         grid.restart(lock, before_us)
@@ -152,7 +152,7 @@ def test_packets_are_averaged_and_changes_followed():
     rng, known = np.random.default_rng(1), RowDelay()
     for row_us, within in ((0.2, 0.03), (0.1, 0.04)):
         for _ in range(30):
-            known = known.measured(row_us + rng.normal(0, 0.03), 0.03)
+            known = known.update(row_us + rng.normal(0, 0.03), 0.03)
         assert known.row_us == pytest.approx(row_us, abs=within)
         assert known.variance < 0.03**2
 

@@ -9,7 +9,7 @@ from rx_streams import LINK, frames_of, received
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.rx.reflections import FrameDetection, Reflections, repeats
+from evlcp_sdk.rx.reflections import FrameDetection, Reflections, repetition_llr
 from evlcp_sdk.values import Events, Frame, Range, SoftSymbols
 
 FORMAT = PacketFormat()
@@ -17,7 +17,7 @@ PERIOD_US = FORMAT.packet_chips * FORMAT.chip_us
 CODEWORDS = 64
 
 
-def sighting(transmitter, number, symbols=None, *, late_us=0.0, x_px=None, light=100.0, **more):
+def frame(transmitter, number, symbols=None, *, late_us=0.0, x_px=None, light=100.0, **more):
     """The frame of a number since the start."""
     symbols = said(number) if symbols is None else symbols
     packet, index = divmod(number, FORMAT.frames)
@@ -49,33 +49,33 @@ def test_evidence_is_the_likelihood_ratio_of_the_two_models(codewords, clusters)
         both, same = (one >= 0) & (other >= 0), one == other
         likely, chance = (share * same + (1 - share) / codewords for share in (1 / 4, 1 / 32))
         ratio = np.log(likely / chance)[both].sum()
-        assert repeats(one, other, codewords) == pytest.approx(ratio, abs=1e-9)
+        assert repetition_llr(one, other, codewords) == pytest.approx(ratio, abs=1e-9)
 
 
-def judged(*steps, echoes=None):
+def echoes_of(*steps, known=None):
     """What is a reflection of what, after these time steps."""
-    echoes = Reflections(FORMAT, CODEWORDS) if echoes is None else echoes
+    known = Reflections(FORMAT, CODEWORDS) if known is None else known
     for step in steps:
-        echoes.judge(step)
-    return {k: of for k in range(50) if (of := echoes.echo_of(k)) is not None}
+        known.add_detections(step)
+    return {k: of for k in range(50) if (of := known.echo_of(k)) is not None}
 
 
 def test_independent_payloads_are_never_taken_for_one():
     """Two transmitters on one clock with other data: 500 pairs of 100 frames, none is a reflection."""
     rng = np.random.default_rng(2)
     for _ in range(50):
-        echoes = Reflections(FORMAT, CODEWORDS)
+        known = Reflections(FORMAT, CODEWORDS)
         for n in range(100):
             symbols = rng.integers(0, CODEWORDS, (5, 16))
-            assert judged([sighting(k, n, s, late_us=k) for k, s in enumerate(symbols)], echoes=echoes) == {}
+            assert echoes_of([frame(k, n, s, late_us=k) for k, s in enumerate(symbols)], known=known) == {}
 
 
 @pytest.mark.parametrize(("right", "frames"), [(16, 1), (12, 1), (8, 1), (4, 10)])
 def test_the_first_frame_is_enough_where_half_of_it_is_right(right, frames):
     rng = np.random.default_rng(3)
     for _ in range(20):
-        images = [sighting(1, n, misread(said(n), right, rng), light=70) for n in range(frames)]
-        assert judged(*([sighting(0, n), image] for n, image in enumerate(images))) == {1: 0}
+        images = [frame(1, n, misread(said(n), right, rng), light=70) for n in range(frames)]
+        assert echoes_of(*([frame(0, n), image] for n, image in enumerate(images))) == {1: 0}
 
 
 @pytest.mark.parametrize("clusters", [8, 6])
@@ -83,50 +83,50 @@ def test_a_partial_reflection(clusters):
     """Only some clusters of the mirror image are seen: those are compared."""
     part = said(0)
     part[: 16 - clusters] = -1
-    assert judged([sighting(0, 0), sighting(1, 0, part, light=70)]) == {1: 0}
+    assert echoes_of([frame(0, 0), frame(1, 0, part, light=70)]) == {1: 0}
     # As bright as the bar, whichever is first.
-    assert judged([sighting(0, 0, part), sighting(1, 0, said(0))]) == {0: 1}
+    assert echoes_of([frame(0, 0, part), frame(1, 0, said(0))]) == {0: 1}
     # What is hidden of the one is all that is seen of the other: nothing is known.
     rest = np.where(part < 0, said(0), -1)
-    assert judged([sighting(0, 0, rest), sighting(1, 0, part, light=70)]) == {}
+    assert echoes_of([frame(0, 0, rest), frame(1, 0, part, light=70)]) == {}
 
 
 def test_frames_at_other_times_are_not_compared():
-    echoes = Reflections(FORMAT, CODEWORDS)
-    assert judged(*([sighting(0, n), sighting(1, n, late_us=60)] for n in range(20)), echoes=echoes) == {}
+    known = Reflections(FORMAT, CODEWORDS)
+    assert echoes_of(*([frame(0, n), frame(1, n, late_us=60)] for n in range(20)), known=known) == {}
     # The lower of two images is read later: 150 rows of 0.2 us are 30 us.
-    lower = sighting(2, 20, late_us=75, y_px=450, light=70)
-    assert judged([sighting(0, 20), lower], echoes=echoes) == {2: 0}
+    lower = frame(2, 20, late_us=75, y_px=450, light=70)
+    assert echoes_of([frame(0, 20), lower], known=known) == {2: 0}
 
 
 @pytest.mark.parametrize(("bar", "road", "rail"), list(permutations(range(3))))
 def test_a_bar_with_two_reflections(bar, road, rail):
-    """In whatever order they are numbered and come: both are reflections of the bar, none of the other."""
-    echoes = Reflections(FORMAT, CODEWORDS)
+    """In whatever order they are numbered and come: both are known of the bar, none of the other."""
+    known = Reflections(FORMAT, CODEWORDS)
     for n in range(3):
-        of_road = sighting(road, n, late_us=30, y_px=450, light=130, mirrored=True)
-        seen = [of_road, sighting(bar, n), sighting(rail, n, late_us=4, light=72)]
-        assert judged(seen[::-1] if n == 1 else seen, echoes=echoes) == {road: bar, rail: bar}
+        of_road = frame(road, n, late_us=30, y_px=450, light=130, mirrored=True)
+        seen = [of_road, frame(bar, n), frame(rail, n, late_us=4, light=72)]
+        assert echoes_of(seen[::-1] if n == 1 else seen, known=known) == {road: bar, rail: bar}
 
 
 def test_two_bars_with_a_reflection_each():
-    seen = [sighting(k, 0, said(0, seed=k // 2), light=100 - 30 * (k % 2)) for k in range(4)]
-    assert judged(seen) == {1: 0, 3: 2}
+    seen = [frame(k, 0, said(0, seed=k // 2), light=100 - 30 * (k % 2)) for k in range(4)]
+    assert echoes_of(seen) == {1: 0, 3: 2}
 
 
 @pytest.mark.parametrize(("off_px", "found"), [(0.0, {}), (4.0, {}), (6.0, {1: 0})])
 def test_one_image_seen_by_two_regions_is_no_reflection(off_px, found):
-    seen = ([sighting(k, n, x_px=400.0 + off_px * k) for k in (0, 1)] for n in range(10))
-    assert judged(*seen) == found
+    seen = ([frame(k, n, x_px=400.0 + off_px * k) for k in (0, 1)] for n in range(10))
+    assert echoes_of(*seen) == found
 
 
 @pytest.mark.parametrize("light", [100.0, 85.0, 50.0, 30.0])
 def test_the_verdict_is_stable(light):
     """Frame by frame, now the one has more light, now the other."""
-    rng, echoes, verdicts = np.random.default_rng(5), Reflections(FORMAT, CODEWORDS), []
+    rng, known, verdicts = np.random.default_rng(5), Reflections(FORMAT, CODEWORDS), []
     for n in range(200):
-        other = sighting(1, n, light=light * math.exp(rng.normal(0, 0.15)))
-        verdicts.append(judged([sighting(0, n), other], echoes=echoes))
+        other = frame(1, n, light=light * math.exp(rng.normal(0, 0.15)))
+        verdicts.append(echoes_of([frame(0, n), other], known=known))
     assert sum(a != b for a, b in pairwise(verdicts)) <= 1
     assert all(verdict == verdicts[10] for verdict in verdicts[10:])
     assert len(verdicts[10]) == 1
@@ -135,36 +135,36 @@ def test_the_verdict_is_stable(light):
 
 @pytest.mark.parametrize("light", [70, 150, 500])
 def test_light_tells_the_bar_unless_one_stands_upside_down(light):
-    seen = ([sighting(0, n, light=light, mirrored=True), sighting(1, n)] for n in range(5))
-    assert judged(*seen) == {0: 1}
+    seen = ([frame(0, n, light=light, mirrored=True), frame(1, n)] for n in range(5))
+    assert echoes_of(*seen) == {0: 1}
 
 
 def test_a_bar_that_appears_after_its_reflection_takes_its_place():
-    echoes = Reflections(FORMAT, CODEWORDS)
+    known = Reflections(FORMAT, CODEWORDS)
     for n in range(12):
-        seen = [sighting(0, n, light=60, mirrored=True), sighting(1, n)]
-        assert judged(seen[:1] if n < 10 else seen, echoes=echoes) == ({} if n < 10 else {0: 1})
+        seen = [frame(0, n, light=60, mirrored=True), frame(1, n)]
+        assert echoes_of(seen[:1] if n < 10 else seen, known=known) == ({} if n < 10 else {0: 1})
     # A weaker reflection that comes later changes nothing.
-    last = [sighting(k, 12, light=light) for k, light in enumerate((60, 100, 65))]
-    assert judged(last, echoes=echoes) == {0: 1, 2: 1}
+    last = [frame(k, 12, light=light) for k, light in enumerate((60, 100, 65))]
+    assert echoes_of(last, known=known) == {0: 1, 2: 1}
 
 
 def test_a_reflection_outlives_its_bar_by_a_second():
-    echoes = Reflections(FORMAT, CODEWORDS)
+    known = Reflections(FORMAT, CODEWORDS)
     for n in range(401):
-        image = sighting(1, n, light=70)
+        image = frame(1, n, light=70)
         # The bar is in sight at first, and again at the end.
-        seen = [sighting(0, n), image] if n in (0, 400) else [image]
-        after_us = image.t_us - sighting(1, 0).t_us
-        assert judged(seen, echoes=echoes) == ({1: 0} if after_us <= 1e6 or n == 400 else {})
+        seen = [frame(0, n), image] if n in (0, 400) else [image]
+        after_us = image.t_us - frame(1, 0).t_us
+        assert echoes_of(seen, known=known) == ({1: 0} if after_us <= 1e6 or n == 400 else {})
 
 
 def test_memory_is_bounded():
-    echoes = Reflections(FORMAT, CODEWORDS)
+    known = Reflections(FORMAT, CODEWORDS)
     for n in range(2000):
-        echoes.judge([sighting(k, n, said(n, seed=k), late_us=k) for k in (0, 1, 2 + n // 50)])
-        assert sum(map(len, echoes._seen.values())) <= 4 * (3 * FORMAT.frames + 1)
-        assert len(echoes._pairs) <= 3 + 2 * 8
+        known.add_detections([frame(k, n, said(n, seed=k), late_us=k) for k in (0, 1, 2 + n // 50)])
+        assert sum(map(len, known._seen.values())) <= 4 * (3 * FORMAT.frames + 1)
+        assert len(known._pairs) <= 3 + 2 * 8
 
 
 @pytest.mark.parametrize(("share", "farther_m"), [(None, 0.0), (None, 12.0), (0.25, 0.0)])
