@@ -97,10 +97,10 @@ def evlcp(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
         finally:
             # A command keeps all that is there when it is loaded, as its process ends with it.
             gc.unfreeze()
-        said = capsys.readouterr()
+        captured = capsys.readouterr()
         # Whichever test is the first to need kernels that are not kept yet.
-        err = [line for line in said.err.splitlines(keepends=True) if "compiling kernels" not in line]
-        return Run(code, said.out, "".join(err))
+        err = [line for line in captured.err.splitlines(keepends=True) if "compiling kernels" not in line]
+        return Run(code, captured.out, "".join(err))
 
     return run
 

@@ -40,8 +40,8 @@ def poses(truth: dict[str, Any], bars: np.ndarray, focal_px: float) -> tuple[np.
 @pytest.mark.skipif(not RECORDING.is_file(), reason="the shared recordings are not beside the repository")
 def test_two_bars_of_another_generator_say_where_the_camera_is() -> None:
     truth, link = json.loads(RECORDING.with_suffix(".truth.json").read_text()), load_link()
-    said = truth["bars"]
-    bars = np.array([[b["x_m"], b["y_m"], b["z_m"] + truth["scene"]["distance_m"]] for b in said])
+    stated = truth["bars"]
+    bars = np.array([[b["x_m"], b["y_m"], b["z_m"] + truth["scene"]["distance_m"]] for b in stated])
     places, attitudes = poses(truth, bars, link.camera.focal_px)
     t_us = np.array(truth["t_s"]) * 1e6 + truth["scene"]["t0_us"]
     # An IMU that is off by one sigma of each angle.
@@ -56,7 +56,7 @@ def test_two_bars_of_another_generator_say_where_the_camera_is() -> None:
         frame = next(p for p in packets if p.transmitter == number).frames[0]
         centres = np.transpose(truth["bar_centre_px"], (2, 1, 0))[0]
         i = int(np.argmin(np.hypot(centres[0] - frame.x_px, centres[1] - frame.y_px)))
-        place, long_m = map(float, AXES.to_geodetic(ENU @ bars[i])), said[i]["length_m"]
+        place, long_m = map(float, AXES.to_geodetic(ENU @ bars[i])), stated[i]["length_m"]
         sites.append(BarSite(i + 1, *place, length_m=long_m, transmitter=number))
     navigator = Navigator(link, PositionPlan(tuple(sites)), log)
     placed = navigator.feed(packets)

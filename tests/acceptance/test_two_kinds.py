@@ -46,8 +46,8 @@ def compare_and_film(folder: Path, links: list[Path], score: dict[str, Any]) -> 
         assert total.frames_found == sum(bar["frames_found"] for bar in score["bars"])
         assert (total.bit_errors, measured.statistics.unmatched) == (0, 0)
     assert table.bounds_m == ()
-    told = film(folder / "two.raw", folder / "two.webp", links, for_ms=2.0, longest_px=200)
-    assert len(told["transmitters"]) == 2
+    reported = film(folder / "two.raw", folder / "two.webp", links, for_ms=2.0, longest_px=200)
+    assert len(reported["transmitters"]) == 2
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +80,8 @@ def test_bars_of_two_links_give_one_position(two_links: tuple[Path, list[Path]],
     fixes = [row for row in rows_of(tmp_path / "fixes.csv") if not row["refusal"]]
     assert {" ".join(sorted(row["link"].split())) for row in fixes} == {"bar short"}
     assert len(fixes) >= 3
-    said = {told["link"] for told in map(json.loads, lines) if told["line"] == "fix"}
-    assert said == {row["link"] for row in fixes}
+    reported = {line["link"] for line in map(json.loads, lines) if line["line"] == "fix"}
+    assert reported == {row["link"] for row in fixes}
     keys = ("latitude_deg", "longitude_deg", "height_m")
     for row in fixes:
         at = [np.interp(float(row["t_us"]) - truth.t0_us, truth.t_us, truth.camera_path[key]) for key in keys]
@@ -106,18 +106,18 @@ def test_bars_of_two_links_are_surveyed(two_links, tmp_path, evlcp) -> None:
     true = {site.transmitter_id: site for site in load_sites(recording.with_suffix(".site.toml"))}
     found = load_sites(out)
     assert [(site.link, site.length_m) for site in found] == [("bar", 0.96), ("short", 0.6)]
-    for site, told in zip(found, json.loads(done.out)["bars"], strict=True):
+    for site, bar in zip(found, json.loads(done.out)["bars"], strict=True):
         axes = LocalAxes.of([true[site.transmitter_id]])
         off = axes.to_enu(site.latitude_deg, site.longitude_deg, site.height_m)
-        assert off @ np.linalg.solve(told["covariance_m2"], off) < 20
+        assert off @ np.linalg.solve(bar["covariance_m2"], off) < 20
         assert site.position_sigma_m < 1
 
     out.write_text(out.read_text().replace('"short"', '"shrot"'))
-    told = "link = 'shrot': no link is named so; did you mean 'short'? (links: bar, short)"
+    line = "link = 'shrot': no link is named so; did you mean 'short'? (links: bar, short)"
     for command in ("receive", "survey"):
         done = evlcp(command, recording, *links, "-o", tmp_path / "more", "--sites", out)
         assert done.code == 2
-        assert done.err.strip().endswith(told)
+        assert done.err.strip().endswith(line)
 
 
 @pytest.mark.parametrize("other", OTHERS)
@@ -152,8 +152,8 @@ def test_bar_and_another_kind(other: str, tmp_path: Path) -> None:
     rows = rows_of(out / "frames.csv")
     assert len({(row["transmitter"], row["link"]) for row in rows}) == 2
     packets = (out / "packets.jsonl").read_text().splitlines()
-    said = [told for told in map(json.loads, lines) if told["line"] == "frame"]
-    for of in (map(json.loads, packets), said, rows):
+    reported = [line for line in map(json.loads, lines) if line["line"] == "frame"]
+    for of in (map(json.loads, packets), reported, rows):
         assert {one["link"] for one in of} == names
     assert f"({other})" in (out / "report.html").read_text()
     parquet = pytest.importorskip("pyarrow.parquet").read_table(out / "frames.parquet")

@@ -100,9 +100,9 @@ def emulator(recording, folder, *options):
 
 @emulated
 def test_symbols_are_those_of_the_file_and_unplugged_it_ends_whole(demo_raw, tmp_path):
-    told = ("--tell", "1010,1018,2000,4000,6008,600C,7004")
+    watched = ("--tell", "1010,1018,2000,4000,6008,600C,7004")
     url = "camera:12345678?diff_on=20&diff_off=-5&events_per_s=4e7&area=0,1,1280,719&trigger=0"
-    with emulator(demo_raw, tmp_path, "--rate", "2e7", "--then", "unplug", *told) as camera:
+    with emulator(demo_raw, tmp_path, "--rate", "2e7", "--then", "unplug", *watched) as camera:
         command = [*COMMAND, "live", url, "-o", str(tmp_path / "out"), "--json", "--waiting-ms", "10000"]
         process = camera.run(command)
         out, err = process.communicate(timeout=150)
@@ -188,7 +188,7 @@ def test_what_the_driver_drops_is_counted(demo_raw, tmp_path):
 
 
 @emulated
-def test_what_is_wrong_is_said_before_anything_is_read(demo_raw, tmp_path):
+def test_what_is_wrong_is_reported_before_anything_is_read(demo_raw, tmp_path):
     program = (
         "import evlcp_sdk as evlcp\n"
         "for url in ('camera:99', 'camera:?diff_of=1', 'camera:?area=0,0,1300,1', 'camera:?diff_off=400'):\n"
@@ -209,7 +209,7 @@ def test_what_is_wrong_is_said_before_anything_is_read(demo_raw, tmp_path):
 def test_each_fault_of_the_driver_is_one_line_with_the_next_step(monkeypatch):
     import neuromorphic_drivers
 
-    for said, told in (
+    for expected, message in (
         ("Other error", "no USB bus that can be read"),
         ("device not found", "plug it into a USB 3 port"),
         ("PropheseeEvk4(Usb(Rusb(Access)))", "sudo neuromorphic-drivers-install-udev-rules"),
@@ -217,10 +217,10 @@ def test_each_fault_of_the_driver_is_one_line_with_the_next_step(monkeypatch):
         ("PropheseeEvk4(RegisterReadShortResponse(4096))", "a port that gives enough power"),
         ("never seen before", "the driver says: never seen before"),
     ):
-        monkeypatch.setattr(neuromorphic_drivers, "list_devices", Mock(side_effect=RuntimeError(said)))
+        monkeypatch.setattr(neuromorphic_drivers, "list_devices", Mock(side_effect=RuntimeError(expected)))
         with pytest.raises(InputError) as fault:
             open_source("camera:")
-        assert told in str(fault.value)
+        assert message in str(fault.value)
         assert len(str(fault.value).splitlines()) == 1
     monkeypatch.setattr(neuromorphic_drivers, "list_devices", list)
     with pytest.raises(InputError, match="no camera was found"):
@@ -228,14 +228,14 @@ def test_each_fault_of_the_driver_is_one_line_with_the_next_step(monkeypatch):
 
 
 def test_options_are_checked(monkeypatch):
-    for url, told in (
+    for url, message in (
         ("camera:?diff_on=high", "diff_on = 'high': expected a whole number"),
         ("camera:?events_per_s=100", "expected 5000 to "),
         ("camera:?area=1,2,3", "expected X,Y,WIDTH,HEIGHT"),
     ):
         with pytest.raises(InputError) as fault:
             open_source(url)
-        assert told in str(fault.value)
+        assert message in str(fault.value)
     monkeypatch.setattr(camera.importlib, "import_module", Mock(side_effect=ImportError))
     with pytest.raises(ConfigError, match=r"pip install 'evlcp-sdk\[camera\]'"):
         open_source("camera:")

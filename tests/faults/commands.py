@@ -77,11 +77,11 @@ def run(arguments, folder, at=-1, how="fails"):
             os._exit(0)
     os.close(outlet)
     with os.fdopen(inlet, "rb") as file:
-        said = file.read()
+        reported = file.read()
     _, status = os.waitpid(pid, 0)
     if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
         return Ended(None)
-    code, err, calls = json.loads(said)
+    code, err, calls = json.loads(reported)
     return Ended(code, err, tuple(calls))
 
 

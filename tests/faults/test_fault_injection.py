@@ -42,7 +42,7 @@ def test_a_disk_that_fails_once(command, shim, tmp_path, demo_raw):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["faults"] == []
-    assert {"write", "fsync", "unlink" if command == "sweep" else "rename"} <= set(told["calls"])
-    assert len(told["calls"]) > 10
+    result = json.loads(done.stdout)
+    assert result["faults"] == []
+    assert {"write", "fsync", "unlink" if command == "sweep" else "rename"} <= set(result["calls"])
+    assert len(result["calls"]) > 10

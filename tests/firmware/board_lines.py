@@ -95,10 +95,10 @@ def well(done):
     return done
 
 
-def check_fault(done, code, *says):
+def check_fault(done, code, *expected):
     """See that a command ended with a code, and one line that says why."""
     assert (done.code, done.err.count("\n")) == (code, 1), done.err
-    assert [words for words in says if words not in done.err] == [], done.err
+    assert [words for words in expected if words not in done.err] == [], done.err
 
 
 class Native:

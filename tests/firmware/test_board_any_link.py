@@ -168,9 +168,9 @@ def test_what_the_firmware_refuses(device, board):
         *[("packet_chips", n, near) for n, near in ((0, 1), (40961, 40960), (2**32 - 1, 40960))],
         *(("hold", 0, 1), ("clusters", 97, 96)),
     ):
-        with pytest.raises(RefusedError) as told:
+        with pytest.raises(RefusedError) as caught:
             call(replace(chips, **{name: wrong}))
-        assert (told.value.status, told.value.detail) == (Status.OUT_OF_RANGE, nearest)
+        assert (caught.value.status, caught.value.detail) == (Status.OUT_OF_RANGE, nearest)
     commit = protocol.CommitRequest(0, bank.format, 2, len(bank.content), bank.crc, digest)
     with pytest.raises(RefusedError):
         call(commit)  # CLUSTERS with a codebook
@@ -189,9 +189,9 @@ def test_what_the_firmware_refuses(device, board):
     overlapping[12] |= overlapping[0]
     overlapping[13] |= overlapping[1]
     board.fill(0, bytes(overlapping))
-    with pytest.raises(RefusedError) as told:
+    with pytest.raises(RefusedError) as caught:
         board.session.call(replace(commit, crc=zlib.crc32(overlapping)))
-    assert (told.value.status, told.value.detail) == (Status.OUT_OF_RANGE, 1)
+    assert (caught.value.status, caught.value.detail) == (Status.OUT_OF_RANGE, 1)
     with pytest.raises(RefusedError):
         board.session.call(protocol.StreamRequest(0, Format.CLUSTERS, commit.digest))
     board.prepare(bank)
@@ -217,9 +217,9 @@ def test_what_hello_says_decides(board):
         board.program(a_bank())
     # a firmware of before says nothing of formats
     says(leds=96, clusters=16, formats=0, minor=1)
-    with pytest.raises(IncompatibleError) as told:
+    with pytest.raises(IncompatibleError) as caught:
         board.program(a_bank())
-    assert str(told.value) == (
+    assert str(caught.value) == (
         "simulated:: its firmware (protocol 2.1) plays packets that it composes alone:"
         " of 96 LEDs in 16 equal clusters, codes of 16 chips, a preamble of at most 32; update the firmware"
     )
@@ -269,12 +269,12 @@ def test_the_commands(evlcp, tmp_path, device, board):
         done = evlcp("board", "--port", "native:", "program", *options, *OPTIONS)
         assert (done.code, done.err) == (0, ""), done.err
         assert f"of {10 * 12 + 2 * len(whole)} bytes" in done.out
-    for rows, cluster_rows, says in (
+    for rows, cluster_rows, message in (
         (80, 8, "LED 80 is lit, the link's bar has 80"),
         (90, 6, "the LEDs of cluster 4 differ; take every LED for itself with --per-led"),
     ):
         other = options_of(f"bar.rows={rows}", f"bar.cluster_rows={cluster_rows}")
-        check_fault(evlcp("board", "leds", record, "--chips", out, *OPTIONS[4:], *other), 3, says)
+        check_fault(evlcp("board", "leds", record, "--chips", out, *OPTIONS[4:], *other), 3, message)
 
 
 # -- characters, by the test's own encoder
@@ -312,7 +312,7 @@ def test_the_image_of_the_part_plays_any_clusters_too(stm32):
 
 def test_a_stream_rests_while_nothing_is_sent(serial, device, board):
     """The board's idle pattern would be characters: packets of pause keep it from being shown."""
-    link, symbols, told = serial
+    link, symbols, packet_chips = serial
     with board.stream(link) as stream:
         stream.wait(0.05)
         assert stream.send(symbols) == 0
@@ -321,8 +321,8 @@ def test_a_stream_rests_while_nothing_is_sent(serial, device, board):
         assert stream.pauses > 5
     assert (stream.underruns, stream.sent) == (0, 4)
     chips = device.records().played().chips(link.bar.led_clusters())
-    packets = chips.reshape(-1, len(told))
-    sent = (packets == told).all(1)
+    packets = chips.reshape(-1, len(packet_chips))
+    sent = (packets == packet_chips).all(1)
     assert (packets[~sent] == 1).all(), "the level of a pause"
     assert sent.sum() == 4
     assert np.flatnonzero(sent)[0] >= 3, "it rests from the first chip on"

@@ -53,10 +53,10 @@ def test_a_users_first_hour(evlcp, native, tmp_path):
     check_fault(board("send", "--random", 1), 5, "'evlcp board program' first")
     eight = ("--random", 8, "--seed", 3)
     done = well(board("program", *eight, "--level", 25, "--watchdog", "idle", "--watchdog-ms", 1500))
-    sent, told = done.out.splitlines()
+    sent, reported = done.out.splitlines()
     assert sent == "sent 2560 of 2560 bytes; bank 0 is active"
     idle = "watchdog: the board shows its idle pattern once no host has spoken for 1.5 s;"
-    assert told.startswith(idle)
+    assert reported.startswith(idle)
     table("status", state="playing", level_ma=25, watchdog="idle", watchdog_ms=1500)
     assert board("watchdog", "idle", "--after-ms", 1500).out.startswith(idle)
     assert "the board goes dark" in board("watchdog", "dark").out
@@ -68,19 +68,19 @@ def test_a_users_first_hour(evlcp, native, tmp_path):
     table("verify", *eight, bank=0, bytes=2560)
     check_fault(board("verify", "--random", 8, "--seed", 4), 7, "byte 0 of bank 0")
     check_fault(board("verify", "--random", 9, "--seed", 4), 7)
-    for other, says in (
+    for other, message in (
         ("modulation.id=wh8", "(wh8) at air.chip_rate_hz = 10000"),
         ("air.chip_rate_hz=5000.0", "at 10000 chips per second, this payload's link has"),
     ):
         for command in ("send", "verify"):
-            check_fault(board(command, *eight, "--set", other), 8, says)
+            check_fault(board(command, *eight, "--set", other), 8, message)
     table("send", "--random", 2, "--seed", 9, bank=1)
     assert "playing" in board("monitor", "--count", 1).out
     table("monitor", "--count", 1, port=native, state="playing")
     table("level", 20, level_ma=20)
     check_fault(board("level", 61), 5, "the nearest value the board can take is 60")
-    says = "this payload has a LED on for 0.5 of the time, the duty limit is 0.3: give a limit of at least"
-    check_fault(board("program", "--random", 8, "--duty-limit", 0.3), 5, says)
+    message = "this payload has a LED on for 0.5 of the time, the duty limit is 0.3: give a limit of at least"
+    check_fault(board("program", "--random", 8, "--duty-limit", 0.3), 5, message)
     check_fault(board("save"), 5)
     table("stop", state="dark")
     assert board("save").out == "saved in slot 0, number 1\n"
@@ -110,7 +110,7 @@ EMULATE = ("board", "emulate", "native")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "kind", "says"),
+    ("arguments", "code", "kind", "message"),
     [
         ((*HELLO, "unix:/nowhere/at/all"), 4, "NoBoardError", "no board listens there"),
         ((*HELLO, "unix:"), 4, "NoBoardError", "expected unix:PATH"),
@@ -144,42 +144,42 @@ EMULATE = ("board", "emulate", "native")
         (("loop", "--set", "air.chip_rate_hz=12.5"), 2, None, "expected whole chips per second"),
     ],
 )
-def test_a_fault_is_one_line_and_json_too(evlcp, tmp_path, monkeypatch, arguments, code, kind, says):
+def test_a_fault_is_one_line_and_json_too(evlcp, tmp_path, monkeypatch, arguments, code, kind, message):
     monkeypatch.chdir(tmp_path)
     done = evlcp(*arguments, *["--json"] * (kind is not None))
-    check_fault(done, code, says)
+    check_fault(done, code, message)
     if kind is not None:
         error = json.loads(done.out)["error"]
         assert (error["exit_code"], error["kind"]) == (code, kind)
-        assert says in error["message"]
+        assert message in error["message"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("board", "level", "much", "--port", "native:"), "MA"),
         (("board", "status", "--no-such", "--port", "native:"), "--no-such"),
         (("tx", "message", "--text", "hi", "--id", "-1"), "--id"),
     ],
 )
-def test_a_fault_of_usage(evlcp, arguments, says):
+def test_a_fault_of_usage(evlcp, arguments, message):
     done = evlcp(*arguments, "--json")
-    assert (done.code, says in done.err, "Traceback" in done.err) == (2, True, False)
+    assert (done.code, message in done.err, "Traceback" in done.err) == (2, True, False)
     assert json.loads(done.out)["error"]["kind"] == "UsageError"
     assert "'ports' takes no --port" in evlcp("board", "--port", "x", "ports").err
 
 
-def test_wrong_records_are_told(evlcp, tmp_path):
+def test_wrong_records_are_reported(evlcp, tmp_path):
     torn, out = tmp_path / "leds.bin", tmp_path / "c.npy"
     records = np.zeros(3, RECORD)
     records["chip"] = (0, 1, 3)
-    for count, says in (
+    for count, message in (
         (60, "at byte 40: chip 3 after chip 1: not an LED record"),
         (19, f"{torn}: 19 bytes, expected LED records of 20 bytes"),
         (0, f"{torn}: 0 bytes, expected LED records of 20 bytes"),
     ):
         torn.write_bytes(records.tobytes()[:count])
-        check_fault(evlcp("board", "leds", torn, "--chips", out), 3, says)
+        check_fault(evlcp("board", "leds", torn, "--chips", out), 3, message)
         assert not out.exists()
     torn.write_bytes(records.tobytes()[:45])
     cut = evlcp("board", "leds", torn, "--chips", out)
@@ -214,13 +214,13 @@ def test_trace_and_replay(evlcp, tmp_path):
     trace.write_text("\n".join(trace.read_text().splitlines()[:5]) + "\n")
     check_fault(evlcp(*arguments, "--replay", trace), 6, "the trace ends here")
     check_fault(evlcp(*arguments, "--replay", trace, "--trace", trace), 2, "give one of the two")
-    for text, says in (
+    for text, message in (
         ('{"evlcp_trace": 1, "first": 1, "nonce": 2, "baud": 9600}\n{"dir": "up"}\n', "line 2: not a trace"),
         ('{"first": 1e999, "nonce": 1, "baud": 1}', "line 1: not a trace"),
         ("[" * 100_000, "line 1: not a trace"),
     ):
         trace.write_text(text)
-        check_fault(evlcp(*arguments, "--replay", trace), 3, f"{trace}: {says}")
+        check_fault(evlcp(*arguments, "--replay", trace), 3, f"{trace}: {message}")
 
 
 def test_line_options_stand_anywhere(evlcp, native, tmp_path, monkeypatch):
@@ -238,7 +238,7 @@ def test_line_options_stand_anywhere(evlcp, native, tmp_path, monkeypatch):
     well(evlcp("board", "--replay", trace, "status"))
 
 
-def test_no_place_to_build_is_told(tmp_path):
+def test_no_place_to_build_is_reported(tmp_path):
     """In a process of its own: this one has built it."""
     (tmp_path / "file").write_text("")
     env = os.environ | {"XDG_CACHE_HOME": str(tmp_path / "file")}
@@ -250,8 +250,8 @@ def test_no_place_to_build_is_told(tmp_path):
 def test_an_emulator_does_not_take_anothers_place(evlcp, native, tmp_path):
     for emulator in ("native", "stm32", "rom"):
         done = evlcp("board", "emulate", emulator, "--listen", native)
-        says = f"--listen {native}: another program answers there; end it, or listen elsewhere"
-        check_fault(done, 2, says)
+        message = f"--listen {native}: another program answers there; end it, or listen elsewhere"
+        check_fault(done, 2, message)
         assert done.out == ""
     well(evlcp("board", "hello", "--port", native))
     # what one that was killed leaves behind is no hindrance
@@ -312,7 +312,7 @@ def test_a_flash_file_is_as_private_as_it_was(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "message"),
     [
         ("no/flash.bin", "No such file or directory"),
         ("folder", "not a file"),
@@ -321,12 +321,12 @@ def test_a_flash_file_is_as_private_as_it_was(tmp_path):
         ("long.bin", "long.bin: not a flash file of"),
     ],
 )
-def test_a_flash_file_that_cannot_be_used_is_left_alone(evlcp, tmp_path, name, says):
+def test_a_flash_file_that_cannot_be_used_is_left_alone(evlcp, tmp_path, name, message):
     (tmp_path / "folder").mkdir()
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "long.bin").write_bytes(bytes(100_000))
     options = ("--listen", f"unix:{tmp_path / 'b'}", "--flash", tmp_path / name)
-    check_fault(evlcp("board", "emulate", "native", *options), 3, says)
-    check_fault(evlcp("board", "hello", "--port", f"native:{tmp_path / name}"), 3, says)
+    check_fault(evlcp("board", "emulate", "native", *options), 3, message)
+    check_fault(evlcp("board", "hello", "--port", f"native:{tmp_path / name}"), 3, message)
     assert (tmp_path / "notes.txt").read_text() == "mine"
     assert (tmp_path / "long.bin").read_bytes() == bytes(100_000)

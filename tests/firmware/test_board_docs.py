@@ -65,7 +65,7 @@ def test_file_of_symbols_is_one(evlcp, tmp_path):
     assert evlcp("tx", "frames", tmp_path / "s.json").code == 0
 
 
-def test_every_command_and_every_key_of_an_inventory_is_told():
+def test_every_command_and_every_key_of_an_inventory_is_reported():
     from firmware_host.board.fleet import Entry
     from firmware_host.commands.board import app
 

@@ -51,7 +51,7 @@ def test_files_hold_one_image(evlcp, tmp_path):
         ("a.elf", b"\x7fELF\x02\x01" + bytes(60), "not one of 32 bits"),
     ],
 )
-def test_damaged_images_are_told(tmp_path, name, content, message):
+def test_damaged_images_are_reported(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=message):
         FlashImage.read(tmp_path / name)
@@ -60,14 +60,14 @@ def test_damaged_images_are_told(tmp_path, name, content, message):
 def test_flashed_read_back_started_and_the_rest_left_alone():
     old, end = some(1 << 20, 1).data, sum(SECTORS[:5])
     rom, new = RomEmulator(old), some(70_001, 2)
-    told = []
+    reports = []
     loader = RomLoader(RomLine(rom))
-    sectors = flash_image(loader, new, progress=lambda done, total: told.append((done, total)))
+    sectors = flash_image(loader, new, progress=lambda done, total: reports.append((done, total)))
     assert sectors == rom.erased == [0, 1, 2, 3, 4]
     assert rom.flash == new.data + b"\xff" * (end - 70_001) + old[end:]
     assert rom.started == FLASH_START
-    assert (told[0], told[-1]) == ((0, 140_008), (140_008, 140_008))
-    assert told == sorted(told)
+    assert (reports[0], reports[-1]) == ((0, 140_008), (140_008, 140_008))
+    assert reports == sorted(reports)
     # one elsewhere takes its own sectors
     rom = RomEmulator(bytes(1 << 20))
     flash_image(RomLoader(RomLine(rom)), some(10, 3, FLASH_START + (128 << 10) - 4), start=False)
@@ -88,7 +88,7 @@ class BadLine(RomLine):
     to_host = to_part
 
 
-def test_a_bad_line_gets_through_or_is_told():
+def test_a_bad_line_gets_through_or_is_reported():
     through = 0
     for seed in range(12):
         rom, new = RomEmulator(), some(6_000, seed)
@@ -121,16 +121,16 @@ class Worn(RomEmulator):
         return good
 
 
-def test_what_cannot_be_flashed_is_told():
+def test_what_cannot_be_flashed_is_reported():
     with pytest.raises(NoBoardError, match="set BOOT0 high, press reset"):
         RomLoader(Cut(RomEmulator(), 0))
     rom = Worn()
-    for part, fault, says in (
+    for part, fault, expected in (
         (RomEmulator(protected=True), RefusedError, "read-out is protected"),
         (RomEmulator(product=0x419), RefusedError, "0x419, expected 0x413"),
         (rom, VerifyError, "at 0x800004d, expected"),
     ):
-        with pytest.raises(fault, match=says):
+        with pytest.raises(fault, match=expected):
             flash_image(RomLoader(RomLine(part)), FlashImage(FLASH_START, bytes(100)))
     assert rom.started is None
     # a line that ends in the middle is told, and the next run goes through
@@ -182,9 +182,9 @@ def test_the_image_for_another_crystal_boots_by_that_one(stm32):
             stm32(wrong, hse_hz)
 
 
-def test_a_part_without_brown_out_is_told(evlcp, tmp_path):
+def test_a_part_without_brown_out_is_reported(evlcp, tmp_path):
     (tmp_path / "image.bin").write_bytes(some(1_000).data)
-    for said, options in ((True, ()), (False, ("--brown-out",))):
+    for warns, options in ((True, ()), (False, ("--brown-out",))):
         rom = RomEmulator()
         before = bytes(rom.options)
         with socket.create_server(("127.0.0.1", 0)) as server:
@@ -194,10 +194,10 @@ def test_a_part_without_brown_out_is_told(evlcp, tmp_path):
             done = evlcp("board", "flash", tmp_path / "image.bin", "--port", port, *options)
             thread.join(10)
         assert done.code == 0, done.err
-        assert ("brown-out reset is off: flash with --brown-out" in done.out) == said
-        assert rom.resets == (not said)
+        assert ("brown-out reset is off: flash with --brown-out" in done.out) == warns
+        assert rom.resets == (not warns)
         # that is set, and nothing else
-        assert rom.options[0] == (before[0] if said else before[0] & 0xF3)
+        assert rom.options[0] == (before[0] if warns else before[0] & 0xF3)
         assert rom.options[1:] == before[1:]
 
 

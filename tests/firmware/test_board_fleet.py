@@ -94,9 +94,9 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards, tmp_path):
     seen = rows("monitor", "--count", 2, "--interval", 0.01)
     assert [row["id"] for row in seen] == ["T0", "T0", "T1", "T1", "T2", "T2"]
     assert {row["state"] for row in seen} == {"playing"}
-    said = evlcp("board", "status", "--inventory", file).out.splitlines()
-    assert sorted(line.split("  ")[0] for line in said) == ["T0", "T1", "T2"]
-    assert all("playing, " in line for line in said)
+    reported = evlcp("board", "status", "--inventory", file).out.splitlines()
+    assert sorted(line.split("  ")[0] for line in reported) == ["T0", "T1", "T2"]
+    assert all("playing, " in line for line in reported)
     # one that is off does not hold up the others
     boards[1].end()
     done = evlcp("board", "stop", "--inventory", file, "--json")

@@ -78,19 +78,19 @@ def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp
 
     done = evlcp(*board, "start", "--pulse-hz", 2, "--timeout", 0.2)
     assert (done.code, done.out) == (6, f"{armed}, for at most 0.2 s\n")
-    said = "the pulse that it waits for has not come in 0.2 s"
+    message = "the pulse that it waits for has not come in 0.2 s"
     assert re.fullmatch(
-        rf"evlcp: {native}: {said} \(pulses since reset: .* 0\): check .*; all are stopped\n", done.err
+        rf"evlcp: {native}: {message} \(pulses since reset: .* 0\): check .*; all are stopped\n", done.err
     )
     assert json.loads(evlcp(*board, "status", "--json").out)["state"] == "dark"
 
 
-def test_a_bank_that_does_not_hold_is_told(board, monkeypatch):
+def test_a_bank_that_does_not_hold_is_reported(board, monkeypatch):
     crc = board.crc
     monkeypatch.setattr(board, "crc", lambda *place: crc(*place) ^ 1)
-    with pytest.raises(VerifyError, match="does not hold what was sent") as told:
+    with pytest.raises(VerifyError, match="does not hold what was sent") as caught:
         board.program(some_bank(2))
-    assert "baud" not in str(told.value)
+    assert "baud" not in str(caught.value)
 
 
 def test_a_second_host_learns_of_the_first(evlcp, native):
@@ -106,7 +106,7 @@ def test_a_second_host_learns_of_the_first(evlcp, native):
             Board(session).status()
 
 
-def test_a_socket_that_hangs_up_is_told():
+def test_a_socket_that_hangs_up_is_reported():
     with socket.create_server(("127.0.0.1", 0)) as server:
         line = SocketTransport.connect(f"tcp:127.0.0.1:{server.getsockname()[1]}")
         server.accept()[0].close()

@@ -72,8 +72,8 @@ def test_limits_hold_at_once_and_outlive_a_reset_by_save(device, board):
     board = board_on(device)
     assert limits(board) == (25, 25, 500)
     # a limit below what plays: refused by host and board, with both numbers, and it plays on
-    says = r"a LED on for 0\.5 of the time, the duty limit is 0\.4: .* at least 0\.5"
-    with pytest.raises(RefusedError, match=says):
+    message = r"a LED on for 0\.5 of the time, the duty limit is 0\.4: .* at least 0\.5"
+    with pytest.raises(RefusedError, match=message):
         board.limit(GOOD, duty=0.4)
     with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*400 of 1000 chips"):
         board._configure(GOOD, 20, 400)

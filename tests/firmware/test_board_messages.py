@@ -81,7 +81,7 @@ def test_a_text_a_file_and_a_beacon(evlcp, site, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "code", "says"),
+    ("options", "code", "message"),
     [
         (("--text", "a\udcff"), 2, "--text: character 2 is not UTF-8"),
         (("--beacon", "two.toml", "--id", "7", "--user", "\udcff"), 2, "--user: character 1 is not UTF-8"),
@@ -97,10 +97,10 @@ def test_a_text_a_file_and_a_beacon(evlcp, site, tmp_path):
         (("--text", "a" * 8000, "--every", "1", "--port", "native:"), 2, "201 packets of 34.6 ms; give"),
     ],
 )
-def test_faults_are_one_line(evlcp, tmp_path, monkeypatch, options, code, says):
+def test_faults_are_one_line(evlcp, tmp_path, monkeypatch, options, code, message):
     monkeypatch.chdir(tmp_path)
     Path("two.toml").write_text(TILTED + TILTED.replace("= 7", "= 8"))
-    check_fault(evlcp("tx", "message", *options), code, says)
+    check_fault(evlcp("tx", "message", *options), code, message)
     well(evlcp("tx", "message", "--beacon", "two.toml", "--id", 8, "--json"))
 
 
@@ -137,8 +137,8 @@ def test_another_link_is_refused_and_says_where(evlcp, tmp_path, other, differ):
 
 def test_without_an_output_nothing_is_sent(evlcp, monkeypatch, tmp_path):
     done = evlcp("tx", "message", "--text", "hi")
-    says = "evlcp: nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips\n"
-    check_fault(done, 2, says)
+    message = "evlcp: nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips\n"
+    check_fault(done, 2, message)
     assert done.out.splitlines()[-1] == "1 packet, 0.0346 s"
     well(evlcp("tx", "message", "--text", "hi", "--json"))
     monkeypatch.setenv("EVLCP_PORT", "native:")
@@ -166,10 +166,12 @@ def test_texts_go_out_as_they_come(native, tmp_path):
                 time.sleep(0.02)
         done = json.loads(process.communicate()[0])
     assert process.returncode == 0
-    said = [messages_of(packet[None])[Kind.TEXT] for packet in packets_on(leds)]
-    assert [m.text for m in said] == ["Green in 3 s", "Green in 2 s", "Green in 1 s"]
-    assert [m.transmitter_id for m in said] == [7, 7, 7]
-    assert sorted({m.sequence for m in said}) == [m.sequence for m in said], "each with a higher number"
+    expected = [messages_of(packet[None])[Kind.TEXT] for packet in packets_on(leds)]
+    assert [m.text for m in expected] == ["Green in 3 s", "Green in 2 s", "Green in 1 s"]
+    assert [m.transmitter_id for m in expected] == [7, 7, 7]
+    assert sorted({m.sequence for m in expected}) == [m.sequence for m in expected], (
+        "each with a higher number"
+    )
     assert done["packets"] == 3
     assert done["underruns"] in (2, 3)
 
@@ -186,7 +188,7 @@ def test_symbols_from_a_file(evlcp, native, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "options", "says"),
+    ("text", "options", "message"),
     [
         (b"hi\n[", ("--lines", "symbols"), "line 1: not JSON"),
         (b"[[1]]", ("--lines", "symbols"), "line 1: symbols[0]: found 1 elements, expected 10 frames"),
@@ -196,17 +198,17 @@ def test_symbols_from_a_file(evlcp, native, tmp_path):
         (b"\xff", (), "cannot be read"),
     ],
 )
-def test_a_wrong_line_is_told(evlcp, tmp_path, text, options, says):
+def test_a_wrong_line_is_reported(evlcp, tmp_path, text, options, message):
     file = tmp_path / "lines"
     file.write_bytes(text)
-    check_fault(evlcp("board", "stream", file, "--port", "native:", *options), 3, says)
+    check_fault(evlcp("board", "stream", file, "--port", "native:", *options), 3, message)
 
 
 def test_a_message_that_changes(evlcp, native, tmp_path):
     began = time.time()
-    said = ("--text", "{n}: {left} s left at {time}", "--time", "--countdown", 100, "--sequence", 40)
+    options = ("--text", "{n}: {left} s left at {time}", "--time", "--countdown", 100, "--sequence", 40)
     done = evlcp(
-        *("tx", "message", *said, "--signal", "amber", "--next", "red", "--every", 1, "--count", 2),
+        *("tx", "message", *options, "--signal", "amber", "--next", "red", "--every", 1, "--count", 2),
         *("--port", native, "--json"),
     )
     assert (done.code, done.err) == (0, "")

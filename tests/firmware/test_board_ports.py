@@ -97,8 +97,8 @@ def test_board_ports(evlcp, ports, opened):
         ("COM9", "1546:01a9", False),
     ]
     assert opened() == ["COM7"]
-    said = evlcp("board", "ports", "--no-ask", "--usb", "0403").out
-    assert said == "COM7  0403:6015 D30A1  COM7 n/a  not asked\n"
+    reported = evlcp("board", "ports", "--no-ask", "--usb", "0403").out
+    assert reported == "COM7  0403:6015 D30A1  COM7 n/a  not asked\n"
     assert opened() == []
     assert "no serial port with USB id ffff" in evlcp("board", "ports", "--usb", "ffff").out
     check_fault(evlcp("board", "ports", "--usb", "no"), 2, "expected VID, VID:PID or VID:PID:SERIAL")
@@ -117,7 +117,7 @@ def test_a_real_tty_gets_no_byte(monkeypatch, evlcp, pty_name):
 
 
 @pytest.mark.parametrize(
-    ("port", "fault", "says"),
+    ("port", "fault", "message"),
     [
         ("/dev/ttyUSB0", ValueError("Failed to set custom baud rate (3)"), "take --baud 3"),
         ("/dev/ttyUSB0", termios.error(5, "Input/output error"), "Input/output error"),
@@ -126,10 +126,10 @@ def test_a_real_tty_gets_no_byte(monkeypatch, evlcp, pty_name):
         ("hwgrep://[", KeyError("x"), "evlcp board ports"),
     ],
 )
-def test_what_cannot_be_opened_says_what_to_do(evlcp, monkeypatch, port, fault, says):
+def test_what_cannot_be_opened_says_what_to_do(evlcp, monkeypatch, port, fault, message):
     monkeypatch.setattr("serial.serial_for_url", Mock(side_effect=fault))
     done = evlcp("board", "hello", "--port", port, "--baud", "3000000")
-    check_fault(done, 4, f"{port}: cannot be opened", says)
+    check_fault(done, 4, f"{port}: cannot be opened", message)
 
 
 def test_a_port_has_one_host(pty_name):

@@ -116,7 +116,7 @@ def test_the_watchdog_acts_on_a_stream_whose_host_is_gone(device, board):
     assert not device.shown().any()
 
 
-def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_told(device, board):
+def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_reported(device, board):
     with suppress(KeyError), board.stream(LINK, 8) as stream:
         for packet in symbols_of(4):
             stream.send(packet)
@@ -130,8 +130,8 @@ def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_told(device, board):
 
 
 def test_what_a_board_refuses(device, board):
-    for ahead, says in ((1, "expected 2 or more"), (500, "holds 127 packets")):
-        with pytest.raises(ConfigError, match=says):
+    for ahead, wanted in ((1, "expected 2 or more"), (500, "holds 127 packets")):
+        with pytest.raises(ConfigError, match=wanted):
             board.stream(LINK, ahead)
     huge = board_link("air.frames_per_packet=700")
     with pytest.raises(ConfigError, match=r"700 frames takes 22400 bytes.*room for two; .* 640 frames"):
@@ -242,8 +242,8 @@ def test_what_changes_is_right_at_its_first_chip(device, latency_s):
                 return None
             at_s = device.now_us * 1e-6 + stream.delay_s
             due_us.append(at_s * 1e6)
-            said = CountdownKind().pack(Countdown("red", "green", 100.0 - at_s))
-            made.append(packets_of([Message(Kind.COUNTDOWN, 7, number, said)], coder))
+            result = CountdownKind().pack(Countdown("red", "green", 100.0 - at_s))
+            made.append(packets_of([Message(Kind.COUNTDOWN, 7, number, result)], coder))
             return made[-1]
 
         assert stream.play(next_one, 0.25) == 8
@@ -253,11 +253,11 @@ def test_what_changes_is_right_at_its_first_chip(device, latency_s):
     starts = starts_of(chips, record.ticks, stream.sent, length)
     packets = [chips[n : n + length].tobytes() for n in np.searchsorted(record.ticks, starts)]
     for message, due in zip(made, due_us, strict=True):
-        (told,) = expected(message, LINK)
-        begun_us = starts[packets.index(told)] / (device.TICK_HZ / 1e6)
+        (reported,) = expected(message, LINK)
+        begun_us = starts[packets.index(reported)] / (device.TICK_HZ / 1e6)
         # the board's answers come late by the line's latency, and with them what is known of its queue
         assert -8_000 <= due - begun_us <= 8_000 + 1e6 * latency_s
-        assert 6 <= packets.count(told) <= 10, "round and round for 0.25 s"
+        assert 6 <= packets.count(reported) <= 10, "round and round for 0.25 s"
 
 
 @pytest.mark.parametrize("how", ["stop", "blank"])

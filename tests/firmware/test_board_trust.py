@@ -61,9 +61,9 @@ def test_a_locked_board_does_all_with_its_key_and_nothing_without(device):
         lambda: stranger.session.call(protocol.UpdateWriteRequest(0, b"1234")),
         lambda: stranger.program(some_bank(1, 2)),
     ):
-        with pytest.raises(RefusedError, match="it has a key: give it with --key") as told:
+        with pytest.raises(RefusedError, match="it has a key: give it with --key") as caught:
             refused()
-        assert told.value.status == Status.NEEDS_KEY
+        assert caught.value.status == Status.NEEDS_KEY
     assert held(device) == before
     with pytest.raises(RefusedError, match=r"has the key .*, this host's is"):
         board_on(device, key=OTHER)
@@ -236,8 +236,8 @@ def test_a_key_is_its_owners_alone(evlcp, tmp_path):
     assert evlcp("board", "keygen", file, "--show", "--json").out == json.dumps({"key": name}) + "\n"
     file.chmod(0o644)
     for command in (("keygen", file, "--show"), ("lock", file, "--port", "native:")):
-        says = "mode 0644, expected a private key that its owner alone can use: chmod 600"
-        check_fault(evlcp("board", *command), 3, says)
+        message = "mode 0644, expected a private key that its owner alone can use: chmod 600"
+        check_fault(evlcp("board", *command), 3, message)
     file.chmod(0o600)
     for text in (b"", b"00" * 16, b"ab" * 15, b"zz" * 16, b"\xff"):
         file.write_bytes(text)

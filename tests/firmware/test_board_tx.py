@@ -69,18 +69,20 @@ def test_wrong_symbols_are_one_line(evlcp, tmp_path, text, expected):
 
 @pytest.mark.parametrize("digest", ['"00"', "5", "null"])
 def test_symbols_of_another_codebook_are_refused(evlcp, tmp_path, digest):
-    said, other = (evlcp("tx", "frames", "--random", 1, "--seed", n, "--format", "json").out for n in (0, 1))
-    assert said != other
+    frames, other = (
+        evlcp("tx", "frames", "--random", 1, "--seed", n, "--format", "json").out for n in (0, 1)
+    )
+    assert frames != other
     path = tmp_path / "s.json"
-    path.write_text(said)
-    assert evlcp("tx", "frames", path, "--format", "json").out == said
-    own = json.loads(said)["codebook"]
-    path.write_text(said.replace(f'"{own}"', digest))
+    path.write_text(frames)
+    assert evlcp("tx", "frames", path, "--format", "json").out == frames
+    own = json.loads(frames)["codebook"]
+    path.write_text(frames.replace(f'"{own}"', digest))
     done = evlcp("tx", "frames", path)
     check_fault(done, 8, f"{path}: codebook = {digest}", f"expected {own[:16]}")
 
 
-def test_wrong_masks_are_told(tmp_path):
+def test_wrong_masks_are_reported(tmp_path):
     path = tmp_path / "m.npy"
     for array, expected in (
         (np.zeros((345, 16), np.uint8), "whole packets of 346 chips"),

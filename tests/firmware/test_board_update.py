@@ -44,11 +44,11 @@ def test_updates_take_turns_and_run_after_every_reset(device, board):
     assert device.bench.running == 0
     assert update_status(board).next == 1
     for n, image in enumerate((1, 2, 1, 2), 1):
-        told = []
+        reports = []
         new = package(n, 3_001)
-        done = update(board, new, lambda at, total, told=told: told.append((at, total)))
+        done = update(board, new, lambda at, total, reports=reports: reports.append((at, total)))
         assert (done.image, done.length, done.sequence) == (image, 3_001, n)
-        assert told[-1] == (3_001, 3_001)
+        assert reports[-1] == (3_001, 3_001)
         assert device.bench.running == image
         assert image_of(device, image, 3_001) == new.images[image]
         assert update_status(board).trial == 0
@@ -121,7 +121,7 @@ def test_what_cannot_be_is_refused(device, board):
     with pytest.raises(RefusedError, match="65473 bytes of firmware, an image may have 65472"):
         update(board, package(1, 65_473))
     begin, write = protocol.UpdateBeginRequest, protocol.UpdateWriteRequest
-    for request, says in (
+    for request, message in (
         (write(0, b"1234"), "NOTHING_COMMITTED"),
         (begin(2, 4, 0), "nearest value the board can take is 1"),
         (begin(1, 0, 0), "OUT_OF_RANGE"),
@@ -133,7 +133,7 @@ def test_what_cannot_be_is_refused(device, board):
         (write(0, b"1234"), None),
         (protocol.UpdateCommitRequest(), "BAD_CRC"),
     ):
-        with pytest.raises(BoardError, match=says) if says else contextlib.nullcontext():
+        with pytest.raises(BoardError, match=message) if message else contextlib.nullcontext():
             board.session.call(request)
     assert resets(device, 1) == [0]
     board = board_on(device)
@@ -186,10 +186,10 @@ def test_a_file_of_an_update(tmp_path):
     damaged = [json.dumps(table | harm).encode() for harm in harms]
     for content in (b"\xff\xfe\x00\x20" * 100, b"{", b"", *damaged):
         path.write_bytes(content)
-        with pytest.raises(InputError) as told:
+        with pytest.raises(InputError) as caught:
             Package.read(path)
-        assert str(told.value).startswith(f"{path}: not a firmware update, or damaged; expected TARGET.")
-        assert "codec" not in str(told.value)
+        assert str(caught.value).startswith(f"{path}: not a firmware update, or damaged; expected TARGET.")
+        assert "codec" not in str(caught.value)
     with pytest.raises(InputError, match="cannot be read: No such file"):
         Package.read(tmp_path / "none.json")
 

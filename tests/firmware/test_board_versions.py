@@ -51,31 +51,36 @@ def every_request(board, bank, update):
     """Say everything of protocol 2.0 once to a board that was just reset; what was answered."""
     call = board.session.call
     provision(board, bank, Settings(level_ma=11, start=False, level_limit_ma=40, duty_limit=0.75))
-    told = [board.about.minor, board.verify(bank)]
+    answers = [board.about.minor, board.verify(bank)]
     board.watchdog(requests.Watchdog.IDLE, 60_000)
-    told += [board.save().slot, board.recall().slot]
+    answers += [board.save().slot, board.recall().slot]
     board.start()
     board.stop()
-    told.append(board.wait_dark().level_limit_ma)
+    answers.append(board.wait_dark().level_limit_ma)
     board.blank()
     board.test_leds(0, 1, 1)
     board.wait_dark()
     with pytest.raises(RefusedError) as refused:
         board.level(41)
-    told.append((refused.value.status, refused.value.detail))
+    answers.append((refused.value.status, refused.value.detail))
     spare = 1 - board.status().active_bank
-    told.append(call(requests.StreamRequest(spare, requests.Format.WORDS, bytes.fromhex(bank.digest))).slots)
+    answers.append(
+        call(requests.StreamRequest(spare, requests.Format.WORDS, bytes.fromhex(bank.digest))).slots
+    )
     push = call(requests.PushRequest(spare, 0, 0, 0, bank.content[:64]))
     state = call(requests.UpdateStatusRequest())
-    told += [(push.number, push.offset, push.begun), (state.running, state.next, state.target.rstrip(b"\0"))]
+    answers += [
+        (push.number, push.offset, push.begun),
+        (state.running, state.next, state.target.rstrip(b"\0")),
+    ]
     call(requests.UpdateBeginRequest(state.next, len(update), zlib.crc32(update)))
-    told += [
+    answers += [
         call(requests.UpdateWriteRequest(0, update)).count,
         call(requests.UpdateCommitRequest()).sequence,
     ]
     call(requests.UpdateConfirmRequest())
     call(requests.UpdateRestartRequest())
-    return told
+    return answers
 
 
 def recorded(name):
@@ -91,8 +96,8 @@ def test_this_host_and_the_firmware_of_2_0(monkeypatch):
     bank = some_bank(1, 1, board_link("air.frames_per_packet=4"))
     with pytest.raises(IncompatibleError, match=r"START with at_pulse is not in its protocol 2\.0"):
         board.start(at_pulse=5)
-    told = [0, 0, 0, 0, 40, (3, 40), 320, (0, 64, 0), (0, 1, b"native"), 200, 1]
-    assert every_request(board, bank, bytes(range(200))) == told
+    answers = [0, 0, 0, 0, 40, (3, 40), 320, (0, 64, 0), (0, 1, b"native"), 200, 1]
+    assert every_request(board, bank, bytes(range(200))) == answers
     assert not line._events
 
 

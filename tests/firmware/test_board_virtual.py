@@ -110,7 +110,7 @@ def test_host_killed_at_any_moment():
     assert min(ends.values()) > 1
 
 
-def test_silence_is_told(device):
+def test_silence_is_reported(device):
     line = SimulatedLine(device)
     deafen(line)
     with pytest.raises(NoBoardError, match="no board answers; check power, cable and --baud"):
@@ -186,7 +186,7 @@ def test_faults_show_and_darken_and_end_the_led_test(device, board):
 
 
 def test_board_reset_at_any_moment():
-    bank, line, told = some_bank(12, 2), recording(playing()), []
+    bank, line, reported = some_bank(12, 2), recording(playing()), []
     provision(board_on(line, nonce=7), bank, Settings())
     for moment in np.random.default_rng(8).integers(1, len(line.written), 14):
         device = playing()
@@ -194,7 +194,7 @@ def test_board_reset_at_any_moment():
         try:
             provision(board_on(line, nonce=7), bank, Settings())
         except BoardResetError as fault:
-            told.append(str(fault))
+            reported.append(str(fault))
         board = board_on(device)
         if board.status().state == State.PLAYING:
             assert board.holds(bank, board.status())
@@ -202,5 +202,5 @@ def test_board_reset_at_any_moment():
         assert board.holds(bank, board.status())
         assert board.status().state == State.PLAYING
     # a reset before HELLO arrives, or after the last request, goes unnoticed by right
-    assert len(told) > 9
-    assert all("was reset" in words and "run the command again" in words for words in told)
+    assert len(reported) > 9
+    assert all("was reset" in words and "run the command again" in words for words in reported)

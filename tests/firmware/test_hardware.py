@@ -72,7 +72,7 @@ def test_pins_are_those_of_the_firmware():
     (chip,) = (p for p in PARTS if p.ref == "U7")
     nets = dict(chip.pins.values())
     hal = (ROOT / "firmware_host" / "firmware" / "hal" / "stm32f405" / "hal.c").read_text()
-    said = dict(re.findall(r"^   \| (P[AB]\d+(?: P[AB]\d+)?) +\| (.*?) +\|$", hal, re.MULTILINE))
+    reported = dict(re.findall(r"^   \| (P[AB]\d+(?: P[AB]\d+)?) +\| (.*?) +\|$", hal, re.MULTILINE))
     for pins, wanted, words in (
         ("PA9 PA10", ("UART_TX", "UART_RX"), "USART1"),
         ("PA5 PA7", ("CLK", "SDI"), "SPI1 clock and data"),
@@ -82,7 +82,7 @@ def test_pins_are_those_of_the_firmware():
         ("PB0", ("OE",), "output enable"),
         ("PB1", ("HOT",), "thermal"),
     ):
-        assert words in said[pins]
+        assert words in reported[pins]
         assert tuple(nets[pin] for pin in pins.split()) == wanted
 
 

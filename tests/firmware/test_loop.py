@@ -30,8 +30,8 @@ def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path):
     assert rest.startswith("0 of ")
     assert float(rest.split("distance ")[1].split(" m")[0]) == pytest.approx(80, abs=0.1)
 
-    told = json.loads((out / "message.json").read_text())["symbols"]
-    expected = symbol_chips(np.array(told), LINK.codebook)
+    result = json.loads((out / "message.json").read_text())["symbols"]
+    expected = symbol_chips(np.array(result), LINK.codebook)
     played = LedRecord.read(out / "leds.bin")
     assert (np.diff(played.ticks) == 1000).all()
     chips = np.load(out / "chips.npy")
@@ -66,7 +66,7 @@ def test_without_a_compiler(evlcp, tmp_path, monkeypatch):
     assert done.err == "evlcp: cc is missing: apt-get install --no-install-recommends gcc libc6-dev make\n"
 
 
-def test_wrong_bits_are_said_of_a_light_without_a_distance_too():
+def test_wrong_bits_are_reported_of_a_light_without_a_distance_too():
     step = {"result": "1 transmitter", "frames": 9, "frames_sent": 10, "bits": 72, "bit_errors": 36}
-    said = "9 of 10 frames, 36 of 72 bits wrong (BER 0.5)"
-    assert _received(step | {"distance_m": None}) == said
+    message = "9 of 10 frames, 36 of 72 bits wrong (BER 0.5)"
+    assert _received(step | {"distance_m": None}) == message

@@ -421,10 +421,10 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("role", "name", "algorithm", "said"), CASES)
-def test_the_law_finds_the_fault(role, name, algorithm, said):
+@pytest.mark.parametrize(("role", "name", "algorithm", "message"), CASES)
+def test_the_law_finds_the_fault(role, name, algorithm, message):
     law = next(law for law in laws_of(role) if law.name == name)
-    with pytest.raises(LawError, match=said):
+    with pytest.raises(LawError, match=message):
         law.hold(Subject(role, algorithm))
 
 

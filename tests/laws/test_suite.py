@@ -86,7 +86,7 @@ def test_the_command_says_one_line_a_law(evlcp):
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         (("ranging", "pco"), "did you mean 'poc'?"),
         (("rangin", "poc"), "no role named 'rangin' (known: detection,"),
@@ -98,10 +98,10 @@ def test_the_command_says_one_line_a_law(evlcp):
         (("ranging", "poc", "--excuse", "exakt=no"), "no ranging law named 'exakt'"),
     ],
 )
-def test_what_is_unknown_ends_with_2(evlcp, given, said):
+def test_what_is_unknown_ends_with_2(evlcp, given, message):
     done = evlcp("check", *given)
     assert done.code == 2
-    assert said in done.err
+    assert message in done.err
     assert not done.out
 
 

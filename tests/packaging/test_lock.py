@@ -64,9 +64,9 @@ def test_the_lock_names_no_registry_and_no_machine():
 def test_the_sbom_names_every_package_of_the_lock():
     """`make sbom`, by its output: the lock's packages, no more and no less, the same each time."""
     command = [sys.executable, ROOT / ".ci" / "sbom.py"]
-    said = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)]
-    assert said[0] == said[1]
-    table = json.loads(said[0])
+    reported = [subprocess.run(command, capture_output=True, text=True, check=True).stdout for _ in range(2)]
+    assert reported[0] == reported[1]
+    table = json.loads(reported[0])
     assert (table["bomFormat"], table["specVersion"]) == ("CycloneDX", "1.6")
     assert table["metadata"]["component"]["name"] == PROJECT["project"]["name"]
     assert {(one["name"], one["version"]) for one in table["components"]} == packages()

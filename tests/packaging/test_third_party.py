@@ -52,8 +52,8 @@ class Environment:
             timeout=300,
         )
         assert done.returncode == code, f"{command}\n{done.stdout}\n{done.stderr}"
-        said = [line for line in done.stderr.splitlines(keepends=True) if "compiling kernels" not in line]
-        return done.stdout + "".join(said)
+        reported = [line for line in done.stderr.splitlines(keepends=True) if "compiling kernels" not in line]
+        return done.stdout + "".join(reported)
 
     def build(self, project):
         """The wheel of a project."""
@@ -123,13 +123,13 @@ def test_a_strangers_package_is_as_good_as_a_built_in(environment):
     assert plugins["ranging", "median-pairs"] == ("evlcp-robust", "1.2.0")
     assert plugins["decoding", "majority"] == ("evlcp-robust", "1.2.0")
     # Its algorithm is checked, and its own tests pass.
-    told = json.loads(environment.run("evlcp", "check", "ranging", "median-pairs", "--json"))
-    assert (told["distribution"], told["version"]) == ("evlcp-robust", "1.2.0")
-    assert {law["status"] for law in told["laws"]} == {"ok"}
+    result = json.loads(environment.run("evlcp", "check", "ranging", "median-pairs", "--json"))
+    assert (result["distribution"], result["version"]) == ("evlcp-robust", "1.2.0")
+    assert {law["status"] for law in result["laws"]} == {"ok"}
     for folder in (EXAMPLE, FORMATS):
-        said = environment.run("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=folder)
-        assert " passed" in said
-        assert "skipped" not in said
+        reported = environment.run("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", cwd=folder)
+        assert " passed" in reported
+        assert "skipped" not in reported
     # Its algorithms and its format are used.
     out = environment.folder / "out"
     sets = ("ranging.id=median-pairs", "ranging.min_spacing=0.4", "decoding.id=majority")
@@ -151,9 +151,9 @@ def test_a_strangers_package_is_as_good_as_a_built_in(environment):
     # Uninstalled they are gone.
     environment.pip("uninstall", "evlcp-roadside", "evlcp-robust")
     none = environment.folder / "none"
-    said = environment.run("evlcp", "receive", RECORDING, "-o", none, "--sink", "distance-lines", code=2)
-    assert "no sink named 'distance-lines'" in said
+    reported = environment.run("evlcp", "receive", RECORDING, "-o", none, "--sink", "distance-lines", code=2)
+    assert "no sink named 'distance-lines'" in reported
     assert not none.exists()
     assert ("ranging", "median-pairs") not in environment.plugins()
-    said = environment.run("evlcp", "config", "--set", "ranging.id=median-pairs", code=2)
-    assert "no ranging algorithm named 'median-pairs'" in said
+    reported = environment.run("evlcp", "config", "--set", "ranging.id=median-pairs", code=2)
+    assert "no ranging algorithm named 'median-pairs'" in reported

@@ -102,12 +102,12 @@ def taken(events: Events, cuts: list[int]) -> tuple[list[Row], CameraClock]:
 
 @settings(max_examples=150, deadline=None)
 @given(st.integers(0, 10_000), CUTS)
-def test_any_split_is_judged_event_by_event(seed: int, cuts: list[int]) -> None:
+def test_any_split_is_assessed_event_by_event(seed: int, cuts: list[int]) -> None:
     events = leaping(seed)
     want, counts, firsts = twin_clock(rows(events))
     got, clock = taken(events, sorted(min(cut, len(events)) for cut in cuts))
     assert got == want
-    assert {name: clock.counts[told] for name, told in NAMES.items()} == counts
+    assert {name: clock.counts[expected] for name, expected in NAMES.items()} == counts
     assert clock.firsts == {NAMES[name]: first for name, first in firsts.items()}
     dropped = sum(counts[name] for name in ("backward", "off", "doubtful"))
     assert clock.counts["events"] == len(events) == len(got) + dropped
@@ -184,7 +184,7 @@ def test_every_event_is_in_its_step_once_and_gaps_are_left_out(seed: int, waits:
     assert all(s.start_us <= t < s.start_us + STEP_US for s in steps for t in s.events.t_us)
     assert [s.end_us for s in steps[:-1]] == [s.start_us + STEP_US for s in steps[:-1]]
     assert steps[-1].end_us == timeline.clock.last_us == want[-1][0]
-    assert {name: timeline.clock.counts[told] for name, told in NAMES.items()} == counts
+    assert {name: timeline.clock.counts[expected] for name, expected in NAMES.items()} == counts
     assert min(counts["backward"], counts["off"]) > 0
     assert timeline.clock.counts["events"] == len(events)
     # A gap is left out as soon as nobody waits.

@@ -205,13 +205,13 @@ def test_the_quickstart_is_the_example(capsys: pytest.CaptureFixture[str], workp
     names: dict[str, Any] = {"__name__": "quickstart"}
     exec((ROOT / "examples" / "quickstart.py").read_text(), names)
     names["main"]("Road works", workplace / "out")
-    said = capsys.readouterr().out.splitlines()
-    assert "read: Road works" in said
-    assert len(said) > 30
+    captured = capsys.readouterr().out.splitlines()
+    assert "read: Road works" in captured
+    assert len(captured) > 30
     code = next(text for text in blocks(ROOT / "docs" / "quickstart.md", "python") if "light_of" in text)
     lines = [line.strip() for line in (ROOT / "examples" / "quickstart.py").read_text().splitlines()]
-    told = [line.strip().replace('text="Road works"', "text=text") for line in code.splitlines()]
-    assert set(told) - set(lines) == {'folder = Path("quickstart-out")'}
+    reported = [line.strip().replace('text="Road works"', "text=text") for line in code.splitlines()]
+    assert set(reported) - set(lines) == {'folder = Path("quickstart-out")'}
 
 
 def test_what_users_read_first_uses_the_public_face_only() -> None:
@@ -239,9 +239,9 @@ def test_every_name_of_the_face_that_a_page_shows_exists() -> None:
 
 def test_the_tree_of_contributing_is_the_tree() -> None:
     text = next(text for text in blocks(ROOT / "CONTRIBUTING.md", "text") if "evlcp_sdk/errors.py" in text)
-    told = re.findall(r"^(\S+)  +\S", text, re.MULTILINE)
-    assert len(told) == len(text.splitlines())
-    for path in told:
+    reported = re.findall(r"^(\S+)  +\S", text, re.MULTILINE)
+    assert len(reported) == len(text.splitlines())
+    for path in reported:
         found = ROOT / path
         assert found.is_dir() if path.endswith("/") else found.is_file(), f"CONTRIBUTING.md: {path}"
     rooms = {
@@ -249,4 +249,4 @@ def test_the_tree_of_contributing_is_the_tree() -> None:
         for path in (ROOT / "evlcp_sdk").iterdir()
         if path.suffix == ".py" or (path / "__init__.py").exists()
     }
-    assert rooms == {path for path in told if path.startswith("evlcp_sdk/")}
+    assert rooms == {path for path in reported if path.startswith("evlcp_sdk/")}

@@ -43,11 +43,11 @@ UNREADABLE = [
 ]
 
 
-@pytest.mark.parametrize(("read", "name", "content", "says"), UNREADABLE)
-def test_what_cannot_be_read_is_one_line(read, name, content, says, tmp_path) -> None:
+@pytest.mark.parametrize(("read", "name", "content", "message"), UNREADABLE)
+def test_what_cannot_be_read_is_one_line(read, name, content, message, tmp_path) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
-    with pytest.raises((ConfigError, InputError), match=says) as caught:
+    with pytest.raises((ConfigError, InputError), match=message) as caught:
         read(tmp_path / name)
     assert "\n" not in str(caught.value)
 
@@ -118,13 +118,13 @@ def test_links_are_neither_followed_nor_replaced(tmp_path: Path, dangling: bool)
 
 
 def test_a_pipe_is_written_and_stays(tmp_path: Path) -> None:
-    pipe, said = tmp_path / "pipe", []
+    pipe, reported = tmp_path / "pipe", []
     os.mkfifo(pipe)
-    reader = threading.Thread(target=lambda: said.append(pipe.read_text()))
+    reader = threading.Thread(target=lambda: reported.append(pipe.read_text()))
     reader.start()
     write_text("through", pipe)
     reader.join(10)
-    assert said == ["through"]
+    assert reported == ["through"]
     assert stat.S_ISFIFO(pipe.lstat().st_mode)
     assert list(tmp_path.iterdir()) == [pipe]
 
@@ -209,7 +209,7 @@ OPTIONAL = "gravity_sigma_deg", "rate_right_deg_s", "rate_down_deg_s", "rate_up_
 
 
 @pytest.mark.parametrize(
-    ("columns", "says"),
+    ("columns", "message"),
     [
         ((*NEEDED, "gravity_sigma"), "column 'gravity_sigma': expected gravity_sigma_deg"),
         ((*NEEDED, "sigma_gravity_deg"), "column '.*': expected gravity_sigma_deg"),
@@ -223,11 +223,13 @@ OPTIONAL = "gravity_sigma_deg", "rate_right_deg_s", "rate_down_deg_s", "rate_up_
         (("t_us",), r"no column height_m \(columns: t_us, height_m, gravity_sigma_deg"),
     ],
 )
-def test_a_column_that_is_not_as_it_is_called_is_told(columns: tuple[str, ...], says: str | None) -> None:
-    if says is None:
+def test_a_column_that_is_not_as_it_is_called_is_reported(
+    columns: tuple[str, ...], message: str | None
+) -> None:
+    if message is None:
         check_columns("a.csv", columns, NEEDED, OPTIONAL)
         return
-    with pytest.raises(ConfigError, match=rf"^a\.csv: line 1: .*{says}"):
+    with pytest.raises(ConfigError, match=rf"^a\.csv: line 1: .*{message}"):
         check_columns("a.csv", columns, NEEDED, OPTIONAL)
 
 

@@ -31,7 +31,7 @@ def start(*arguments: str | Path, alone: bool = False) -> subprocess.Popen[str]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
-def test_a_run_that_is_told_to_end_keeps_what_it_has(number, demo_raw, tmp_path) -> None:
+def test_a_run_that_is_asked_to_end_keeps_what_it_has(number, demo_raw, tmp_path) -> None:
     pipe, out = tmp_path / "live.raw", tmp_path / "out"
     os.mkfifo(pipe)
     process = start("receive", pipe, "-o", out)
@@ -44,9 +44,9 @@ def test_a_run_that_is_told_to_end_keeps_what_it_has(number, demo_raw, tmp_path)
         # It may have ended by now, and nobody reads on.
         with suppress(BrokenPipeError):
             file.write(data[len(data) // 2 :])
-        _, said = process.communicate(timeout=60)
+        _, reported = process.communicate(timeout=60)
     # Before it may stand that kernels were compiled.
-    assert said.splitlines()[-1] == f"evlcp: interrupted; what was decoded until then is in {out}"
+    assert reported.splitlines()[-1] == f"evlcp: interrupted; what was decoded until then is in {out}"
     assert process.returncode == 130
     summary = json.loads((out / "summary.json").read_text())
     assert summary["status"] == "interrupted"
@@ -54,14 +54,14 @@ def test_a_run_that_is_told_to_end_keeps_what_it_has(number, demo_raw, tmp_path)
     assert {p.name for p in out.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
 
 
-def test_a_simulation_that_is_told_to_end_leaves_nothing(tmp_path: Path) -> None:
+def test_a_simulation_that_is_asked_to_end_leaves_nothing(tmp_path: Path) -> None:
     process = start("simulate", "--preset", "night", "-o", tmp_path / "a.raw", "--set", "duration_s=60")
     until = time.monotonic() + 60
     while not list(tmp_path.glob(".evlcp-*/a.raw")) and time.monotonic() < until:
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)
-    out, said = process.communicate(timeout=60)
-    assert (process.returncode, out, said.splitlines()[-1:]) == (130, "", ["evlcp: interrupted"])
+    out, reported = process.communicate(timeout=60)
+    assert (process.returncode, out, reported.splitlines()[-1:]) == (130, "", ["evlcp: interrupted"])
     assert list(tmp_path.iterdir()) == []
 
 
@@ -103,6 +103,6 @@ def test_a_stream_whose_sender_never_speaks_is_left_at_once(command: str, tmp_pa
     while listens not in Path("/proc/net/udp").read_text() and time.monotonic() < until:
         time.sleep(0.02)
     process.send_signal(signal.SIGTERM)
-    _, said = process.communicate(timeout=20)
-    assert (process.returncode, said) == (130, "evlcp: interrupted\n")
+    _, reported = process.communicate(timeout=20)
+    assert (process.returncode, reported) == (130, "evlcp: interrupted\n")
     assert list(tmp_path.iterdir()) == []

@@ -30,7 +30,7 @@ class Outer:
 
 
 @pytest.mark.parametrize(
-    ("table", "says"),
+    ("table", "message"),
     [
         ({}, "count: missing"),
         ({"iner": {}}, "iner: unknown table; did you mean 'inner'? (known: count, inner,"),
@@ -42,11 +42,11 @@ class Outer:
         ({"either": 3}, "either = 3: expected a valid string or a table"),
     ],
 )
-def test_a_fault_is_one_line_with_path_value_and_what_was_expected(table, says) -> None:
+def test_a_fault_is_one_line_with_path_value_and_what_was_expected(table, message) -> None:
     with pytest.raises(SpecError) as caught:
         build_spec(Outer, {"count": 1} | table if table else {})
     (line,) = caught.value.lines("f.toml: ")
-    assert line.startswith(f"f.toml: {says}")
+    assert line.startswith(f"f.toml: {message}")
     assert caught.value.exit_code == 2
 
 

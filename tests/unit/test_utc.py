@@ -53,13 +53,13 @@ def test_utc_is_that_of_the_pulses(ppm: float, near_s: float) -> None:
 
 def test_what_was_called_a_time_is_called_it_still() -> None:
     """No later pulse changes what a time is called."""
-    clock, told = PulseClock(near=BEGIN), []
+    clock, expected = PulseClock(near=BEGIN), []
     rng = np.random.default_rng(5)
     seconds = [camera_us(s, 20.0) + rng.integers(-3, 4) for s in range(40)]
     for t_us in seconds:
         clock.add(edges([t_us]), 0.0, 0.0)
-        told.append((t_us + 5e5, clock.utc_s(t_us + 5e5)))
-    assert [clock.utc_s(t_us) for t_us, _ in told] == [utc_s for _, utc_s in told]
+        expected.append((t_us + 5e5, clock.utc_s(t_us + 5e5)))
+    assert [clock.utc_s(t_us) for t_us, _ in expected] == [utc_s for _, utc_s in expected]
 
 
 def test_strays_are_left_out_and_counted_and_a_leap_is_believed() -> None:

@@ -49,7 +49,7 @@ def test_both_are_received(tmp_path: Path) -> None:
     assert first == "distance,transmitter=0 depth_m=49.0000,sigma_m=0.2500 3200000"
 
 
-def test_what_cannot_be_said_is_refused() -> None:
+def test_what_cannot_be_written_is_refused() -> None:
     with pytest.raises(evlcp.ConfigError, match="speed-limit"):
         evlcp.compose(other={"speed-limit": (300, 1)})
     with pytest.raises(evlcp.ConfigError, match="no message kind named 'speed' "):

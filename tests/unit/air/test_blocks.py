@@ -46,7 +46,7 @@ def test_a_message_is_the_sum_of_its_blocks(transmitter_id, sequence, payload, s
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "expected"),
     [
         ({0: 0x22}, "format version 2, expected 1"),
         ({0: 0x00}, "format version 0"),
@@ -57,12 +57,12 @@ def test_a_message_is_the_sum_of_its_blocks(transmitter_id, sequence, payload, s
         ({23: 1}, "bytes 19 to 23 of the block: expected zeros"),
     ],
 )
-def test_what_is_no_block_is_told(change: dict[int, int], told: str) -> None:
+def test_what_is_no_block_is_reported(change: dict[int, int], expected: str) -> None:
     block = bytearray(Block(Kind.TEXT, 7, 1, 0, 2, DIGEST, b"Hi").pack(24))
     assert Block.unpack(bytes(block)).part == b"Hi"
     for at, value in change.items():
         block[at] = value if at < 17 else block[at] ^ value
-    with pytest.raises(BlockError, match=told):
+    with pytest.raises(BlockError, match=expected):
         Block.unpack(bytes(block))
 
 
@@ -71,7 +71,7 @@ BEYOND = (90.1, -181.0, math.nan, -1.0, 181.0, 0.0), (-90.1, 181.0, -13e3, 361.0
 
 
 @pytest.mark.parametrize(
-    ("make", "told"),
+    ("make", "expected"),
     [
         (lambda: Message(Kind.TEXT, -1, 0, b"a"), "transmitter_id = -1, expected 0 to 4294967295"),
         (lambda: Message(Kind.TEXT, 0, 2**32, b"a"), "sequence = 4294967296, expected"),
@@ -85,8 +85,8 @@ BEYOND = (90.1, -181.0, math.nan, -1.0, 181.0, 0.0), (-90.1, 181.0, -13e3, 361.0
         (lambda: Beacon.unpack(struct.pack("<qqiHHI", 91 * 10**9, 0, 0, 0, 0, 1)), "latitude_deg"),
     ],
 )  # fmt: skip
-def test_what_is_no_message_is_told(make: Callable[[], object], told: str) -> None:
-    with pytest.raises((ConfigError, BlockError), match=told):
+def test_what_is_no_message_is_reported(make: Callable[[], object], expected: str) -> None:
+    with pytest.raises((ConfigError, BlockError), match=expected):
         make()
 
 

@@ -90,7 +90,7 @@ CHIPS = Codebook("ppm", np.array([0, 1, 1]), np.array([[0, 1, 0], [1, 0, 0]]), n
 
 
 @pytest.mark.parametrize(
-    ("make", "says"),
+    ("make", "message"),
     [
         (lambda: Codebook.of_values("x", hadamard(2)[0], np.ones((2, 8), np.int8), hadamard(8)),
          "pilots: rows 0 and 1 are equal"),
@@ -108,8 +108,8 @@ CHIPS = Codebook("ppm", np.array([0, 1, 1]), np.array([[0, 1, 0], [1, 0, 0]]), n
         (lambda: packet_chips([[0.5] * 16], book_of("wh4x2")), "expected integers"),
     ],
 )  # fmt: skip
-def test_what_is_no_code_or_symbol_is_named(make: Callable[[], object], says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
+def test_what_is_no_code_or_symbol_is_named(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         make()
 
 

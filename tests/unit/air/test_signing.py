@@ -54,7 +54,7 @@ def test_a_key_that_others_can_use_is_refused(mode: int, tmp_path: Path) -> None
     signing.read_key(path)
 
 
-def test_what_is_no_key_is_told(tmp_path: Path) -> None:
+def test_what_is_no_key_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "k.pem"
     with pytest.raises(InputError, match="cannot be read"):
         signing.read_key(path)
@@ -70,7 +70,7 @@ def test_what_is_no_key_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ("key = 'ab'", "key = 'ab': expected a public key of 64 hex digits, as 'evlcp tx keygen'"),
         ("first_id = 9\nlast_id = 7", "last_id = 7: expected not before first_id, 9"),
@@ -79,13 +79,13 @@ def test_what_is_no_key_is_told(tmp_path: Path) -> None:
         ("latitude_deg = 35.0", "radius_m of an area: give all or none"),
     ],
 )
-def test_faults_of_trusted_keys_are_one_line(given: str, told: str, tmp_path: Path) -> None:
+def test_faults_of_trusted_keys_are_one_line(given: str, message: str, tmp_path: Path) -> None:
     key = "" if given.startswith("key") else f"key = '{'00' * 32}'\n"
     path = tmp_path / "link.toml"
     path.write_text(f"[[messages.trusted_keys]]\n{key}{given}\n")
     with pytest.raises(ConfigError) as refused:
         load_link(path)
-    assert told in str(refused.value)
+    assert message in str(refused.value)
     assert str(refused.value).startswith(f"{path}: ")
     assert "\n" not in str(refused.value)
 

@@ -128,9 +128,9 @@ def test_a_recording_of_which_much_is_dropped_is_degraded(evlcp, noise_raw, tmp_
     path.write_bytes(data[:middle] + b"\x00\x90" * (len(data) // 10) + data[middle:])
     done = evlcp("receive", path, "-o", tmp_path / "out")
     assert done.code == 4
-    told = summary_of(tmp_path / "out")
-    assert told["status"] == "degraded"
-    assert told["losses"]["reserved_words"]["count"] == len(data) // 10
+    output = summary_of(tmp_path / "out")
+    assert output["status"] == "degraded"
+    assert output["losses"]["reserved_words"]["count"] == len(data) // 10
     assert done.err.startswith(f"evlcp: {path}: ")
     assert "were dropped" in done.err
     assert f"lost: {len(data) // 10} " in done.out
@@ -149,7 +149,7 @@ SITES = [BarSite(1, 35.1, 137.0, 50.0)]
 
 
 @pytest.mark.parametrize(
-    ("args", "told"),
+    ("args", "message"),
     [
         ("REC -o OUT --set nonsense", "--set nonsense: expected table.key=value, e.g. modulation.id=wh8"),
         ("REC -o OUT -c missing.toml", "evlcp: missing.toml: cannot be read: No such file or directory"),
@@ -167,12 +167,12 @@ SITES = [BarSite(1, 35.1, 137.0, 50.0)]
         ("REC -o OUT --gnss none.csv", "needs --sites"),
     ],
 )
-def test_usage_and_configuration_end_with_2(evlcp, demo_raw, tmp_path, args, told) -> None:
+def test_usage_and_configuration_end_with_2(evlcp, demo_raw, tmp_path, args, message) -> None:
     (tmp_path / "site.toml").write_text(to_toml(SITES))
     places = {"REC": demo_raw, "OUT": tmp_path / "out", "S": tmp_path / "site.toml"}
     done = evlcp("receive", *(places.get(one, one) for one in args.split()))
     assert done.code == 2
-    assert told in words(done.err)
+    assert message in words(done.err)
     assert not (tmp_path / "out").exists()
     assert "Traceback" not in done.err
 
@@ -265,13 +265,13 @@ def test_config_prints_what_it_loads(evlcp: Evlcp, tmp_path: Path) -> None:
 def test_demo_against_the_truth(evlcp: Evlcp, tmp_path: Path) -> None:
     done = evlcp("demo", "--recording", "-o", tmp_path, "--json")
     assert done.code == 0
-    told = json.loads(done.out)["score"]
+    output = json.loads(done.out)["score"]
     truth = Path(__file__).parents[3] / "examples" / "recordings" / "night-50m-30kmh-cut.truth.json"
-    assert json.loads(evlcp("score", tmp_path, truth, "--json").out) == told
-    (result,) = told["bars"]
+    assert json.loads(evlcp("score", tmp_path, truth, "--json").out) == output
+    (result,) = output["bars"]
     assert result["frames_found"] >= 0.9 * result["frames_sent"]
     assert result["frames_sent"] == 21
-    assert told["unmatched"] == 0
+    assert output["unmatched"] == 0
     assert result["bit_errors"] <= 1e-3 * result["bits"]
     assert result["rmse_m"] <= 0.12
     assert names_in(tmp_path) == FILES | set(FIGURE_NAMES)
@@ -303,10 +303,10 @@ def test_what_is_found_comes_as_files_and_as_lines(evlcp: Evlcp, street: Path, t
     assert done.code == 0
     files = {"fixes.csv", "track.csv", "fixes.geojson", "fixes.nmea", "track.png"}
     assert names_in(tmp_path) == FILES | files | set(FIGURE_NAMES)
-    fixes, told = rows_of(tmp_path / "fixes.csv"), summary_of(tmp_path)
+    fixes, output = rows_of(tmp_path / "fixes.csv"), summary_of(tmp_path)
     placed = [row for row in fixes if not row["refusal"]]
-    assert len(placed) == told["positions"]["fixes"] >= 3
-    assert sorted(told["positions"]["bars"].values()) == [1, 2]
+    assert len(placed) == output["positions"]["fixes"] >= 3
+    assert sorted(output["positions"]["bars"].values()) == [1, 2]
     truth = json.loads((street / "rec.truth.json").read_text())
     for row in placed:
         at = float(row["t_us"]) * 1e-6
@@ -320,20 +320,20 @@ def test_what_is_found_comes_as_files_and_as_lines(evlcp: Evlcp, street: Path, t
     rows = rows_of(tmp_path / "frames.csv")
     for key in ("t_us", "distance_m"):
         assert [one[key] for one in of_kind["frame"]] == [float(row[key]) for row in rows]
-    said = lines_of((tmp_path / "packets.jsonl").read_text())
-    assert of_kind["message"] == [one for one in said if one["kind"] != "packet"] != []
+    reported = lines_of((tmp_path / "packets.jsonl").read_text())
+    assert of_kind["message"] == [one for one in reported if one["kind"] != "packet"] != []
     assert [one["refusal"] for one in of_kind["fix"]] == [row["refusal"] for row in fixes]
     # A packet's frames are told before the next packet's, and the summary last.
     assert kinds[-1] == "summary"
     assert kinds.index("message") < len(kinds) - 1 - kinds[::-1].index("frame")
-    assert lines[-1] == told
+    assert lines[-1] == output
     # People read what was received, and where the camera was in the end.
-    assert [one["said"].startswith("beacon at 35.") for one in told["messages"]] == [True, True]
+    assert [one["said"].startswith("beacon at 35.") for one in output["messages"]] == [True, True]
     last = placed[-1]
-    assert told["positions"]["last"]["t_us"] == float(last["t_us"])
+    assert output["positions"]["last"]["t_us"] == float(last["t_us"])
     for text in (
         f"{len(placed)} positions",
-        told["messages"][0]["said"],
+        output["messages"][0]["said"],
         f"the last one {float(last['latitude_deg']):.7f}, ",
     ):
         assert text in done.err
@@ -392,11 +392,11 @@ def test_a_car_surveys_a_new_bar_on_its_way(evlcp: Evlcp, street: Path, tmp_path
     assert "expected --clock-zero" in words(evlcp(*survey).err)
     done = evlcp(*survey, "--clock-zero", "2026-03-01T12:00:00Z", "--json")
     assert done.code == 0, done.err
-    (bar,), (told,) = load_sites(new), json.loads(done.out)["bars"]
+    (bar,), (reported,) = load_sites(new), json.loads(done.out)["bars"]
     assert bar.transmitter_id == bars[1].transmitter_id
     error = LocalAxes.of([bars[1]]).to_enu(bar.latitude_deg, bar.longitude_deg, bar.height_m)
-    assert error @ np.linalg.solve(told["covariance_m2"], error) < 20
-    assert told["views"] == 7
+    assert error @ np.linalg.solve(reported["covariance_m2"], error) < 20
+    assert reported["views"] == 7
     assert 0.01 < bar.position_sigma_m < 0.5
     for given in ((), ("--poses", "x.csv", "--sites", one), ("--poses", "x.csv", "--gnss", "x.csv")):
         assert evlcp("survey", street / "rec.raw", "-o", new, *given).code == 2
@@ -435,13 +435,13 @@ def test_live_takes_what_receive_takes(evlcp: Evlcp, street: Path, tmp_path: Pat
     assert json.loads(done.out)["positions"]["fixes"] > 2
     for name in ("frames.csv", "packets.jsonl", "fixes.csv", "track.csv"):
         assert (tmp_path / "live" / name).read_text() == (tmp_path / "file" / name).read_text(), name
-    told = []
+    reports = []
     for name in ("file", "live"):
         with (tmp_path / name / "fixes.mcap").open("rb") as file:
             messages = [(c.topic, m.log_time, m.data) for _, c, m in reader.make_reader(file).iter_messages()]
-        told.append(sorted(messages))
-    assert {topic for topic, _, _ in told[0]} >= {"/image", "/regions", "/frames", "/fix", "/scene"}
-    assert told[0] == told[1]
+        reports.append(sorted(messages))
+    assert {topic for topic, _, _ in reports[0]} >= {"/image", "/regions", "/frames", "/fix", "/scene"}
+    assert reports[0] == reports[1]
     assert evlcp("live", recording, "--mcap").code == 2
 
 
@@ -452,16 +452,16 @@ def test_calibrate_finds_the_focal_length(evlcp: Evlcp, street: Path, tmp_path: 
     done = evlcp(*given, "--set", "camera.focal_mm=34.7")
     assert done.code == 0, done.err
     table = tomllib.loads(done.out)["camera"]
-    told = json.loads(evlcp(*given, "--json").out)
-    assert abs(table["focal_mm"] - 35) < 5 * told["sigma"]["focal_mm"]
-    assert told["sigma"]["focal_mm"] < 0.05
-    assert told["camera"]["focal_mm"] == pytest.approx(table["focal_mm"], abs=1e-4)
-    assert told["views"] == 3
+    output = json.loads(evlcp(*given, "--json").out)
+    assert abs(table["focal_mm"] - 35) < 5 * output["sigma"]["focal_mm"]
+    assert output["sigma"]["focal_mm"] < 0.05
+    assert output["camera"]["focal_mm"] == pytest.approx(table["focal_mm"], abs=1e-4)
+    assert output["views"] == 3
     # A table for link.toml.
     link = tmp_path / "link.toml"
     link.write_text(done.out)
     assert evlcp("config", "--digest", "-c", link).code == 0
-    assert told["poses"] == 3
+    assert output["poses"] == 3
     write_rows(poses, [*rows, rows[-1] | {"t_us": 9_110_000}])
     assert "# 1 of 4 poses show no bar\n" in evlcp(*given).out
     write_rows(poses, [{"recording": "other.raw"} | row for row in rows])

@@ -41,9 +41,9 @@ def test_the_numbers_are_those_of_receive_and_score(evlcp: Evlcp, recording: Pat
     for name, settings in VARIANTS.items():
         options = [part for setting in settings for part in ("--set", setting)]
         assert evlcp("receive", recording, "-o", tmp_path / name, *options).code == 0
-        told = json.loads(evlcp("score", tmp_path / name, tmp_path / "REC.truth.json", "--json").out)
-        (bar,), (road,), row = told["bars"], told["road"]["bars"], rows[name]
-        assert (row["frames"], row["unmatched"]) == (told["rows"], told["unmatched"])
+        result = json.loads(evlcp("score", tmp_path / name, tmp_path / "REC.truth.json", "--json").out)
+        (bar,), (road,), row = result["bars"], result["road"]["bars"], rows[name]
+        assert (row["frames"], row["unmatched"]) == (result["rows"], result["unmatched"])
         assert (round(row["ber"], 6), round(row["gross_share"], 4)) == (bar["ber"], bar["over_half_metre"])
         assert row["nees"] == pytest.approx(road["nees"], rel=0.02)
         frames = read_frames(tmp_path / name)
@@ -92,7 +92,7 @@ def test_text_and_files(evlcp: Evlcp, recording: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "told"),
+    ("arguments", "code", "message"),
     [
         ((), 2, "name at least one"),
         (("--variant", "a:ranging.id=pco"), 2, "--variant a: no ranging algorithm named 'pco'"),
@@ -105,11 +105,11 @@ def test_text_and_files(evlcp: Evlcp, recording: Path, tmp_path: Path) -> None:
         (("--variant", "a:camera.width=640"), 2, "recorded with 1280 x 720 pixels"),
     ],
 )
-def test_faults(evlcp, recording, monkeypatch, arguments, code, told) -> None:
+def test_faults(evlcp, recording, monkeypatch, arguments, code, message) -> None:
     monkeypatch.chdir(recording.parent)
     done = evlcp("compare", "REC.raw", *arguments)
     assert done.code == code
-    assert told in " ".join(done.err.replace("│", " ").split())
+    assert message in " ".join(done.err.replace("│", " ").split())
     assert "Traceback" not in done.err
     assert done.out == ""
 

@@ -77,14 +77,14 @@ def test_ctrl_c_during_imports_is_one_line(demo_raw: Path) -> None:
         assert process.stderr.read(5) == "ready"
         time.sleep(pause_s)
         process.send_signal(signal.SIGINT)
-        said = process.stderr.read()
+        reported = process.stderr.read()
         process.stderr.close()
-        assert said == "evlcp: interrupted\n"
+        assert reported == "evlcp: interrupted\n"
         assert process.wait() == 130
 
 
 @pytest.mark.parametrize(
-    ("fault", "code", "said"),
+    ("fault", "code", "message"),
     [
         (
             KeyError("no\nsuch key"),
@@ -96,14 +96,14 @@ def test_ctrl_c_during_imports_is_one_line(demo_raw: Path) -> None:
     ],
 )
 def test_a_fault_of_ours_says_what_to_report_and_too_little_memory_is_none(
-    evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch, demo_raw: Path, fault: Exception, code: int, said: str
+    evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch, demo_raw: Path, fault: Exception, code: int, message: str
 ) -> None:
     def broken(*_: object) -> None:
         raise fault
 
     monkeypatch.setattr(evlcp_sdk.io.describe, "describe_source", broken)
     done = evlcp("info", demo_raw)
-    first, *parts = said.split("|")
+    first, *parts = message.split("|")
     assert done.code == code
     assert done.err.startswith(first)
     assert all(part in done.err for part in parts)
@@ -113,11 +113,11 @@ def test_a_fault_of_ours_says_what_to_report_and_too_little_memory_is_none(
 def test_the_entry_point_can_be_interrupted_from_the_start() -> None:
     """What it imports before it can catch an interrupt is next to nothing."""
     code = "import sys; import evlcp_sdk.cli.main; print(*sys.modules)"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert {name.removeprefix("evlcp_sdk") for name in said.split() if name.startswith("evlcp")} == {
+    reported = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert {name.removeprefix("evlcp_sdk") for name in reported.split() if name.startswith("evlcp")} == {
         *("", ".cli", ".cli.main", ".cli._complain", ".printable")
     }
-    assert not {"typer", "rich", "typing", "pathlib", "logging"} & set(said.split())
+    assert not {"typer", "rich", "typing", "pathlib", "logging"} & set(reported.split())
 
 
 def test_without_a_home_libraries_say_nothing() -> None:

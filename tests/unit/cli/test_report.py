@@ -148,8 +148,8 @@ def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) ->
                 # What is told of the last points of wide charts stays within those that become narrow.
                 assert browser.fits()
                 for chart in CHARTS if width == 1280 else ():
-                    told = browser.hover(chart, max(plots[chart]))
-                    assert "km/h" in told, f"{chart}: nothing is told where the pointer is"
+                    reported = browser.hover(chart, max(plots[chart]))
+                    assert "km/h" in reported, f"{chart}: nothing is told where the pointer is"
         drawn_lines = (
             "[...document.querySelectorAll('#rmse .area path')].filter(e => e.checkVisibility()).length"
         )

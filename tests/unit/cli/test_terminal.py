@@ -81,12 +81,12 @@ def test_commands_print_by_the_one_way_only() -> None:
         assert not others, path
 
 
-def test_the_log_is_said_on_stderr(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_log_is_on_stderr(capsys: pytest.CaptureFixture[str]) -> None:
     with log_on_stderr():
         logging.getLogger("evlcp_sdk.kernels").info("compiling\x1b")
     logging.getLogger("evlcp_sdk.kernels").info("not said")
-    said = capsys.readouterr()
-    assert (said.out, said.err) == ("", "evlcp: compiling\\x1b\n")
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err) == ("", "evlcp: compiling\\x1b\n")
 
 
 def table_of(head: list[str], rows: list[list[str]], names: int = 1, **screen: Any) -> str:
@@ -100,9 +100,9 @@ def table_of(head: list[str], rows: list[list[str]], names: int = 1, **screen: A
 def test_all_columns_are_there_and_each_part_says_of_what(width: int, terminal: bool, parts: int) -> None:
     head = ["series", "distance", *(f"figure {i}" for i in range(9))]
     rows = [[f"{name} {i}" for i in range(11)] for name in ("one bar", "two bars")]
-    told = table_of(head, rows, names=2, force_terminal=terminal, width=width, soft_wrap=True)
-    assert all(cell in told for row in rows for cell in row)
-    assert "…" not in told
-    assert told.count("one bar 1") == parts + 1  # "one bar 10" begins so, too.
-    assert told.count("one bar 0") == parts
-    assert not terminal or max(map(len, told.splitlines())) <= width
+    reported = table_of(head, rows, names=2, force_terminal=terminal, width=width, soft_wrap=True)
+    assert all(cell in reported for row in rows for cell in row)
+    assert "…" not in reported
+    assert reported.count("one bar 1") == parts + 1  # "one bar 10" begins so, too.
+    assert reported.count("one bar 0") == parts
+    assert not terminal or max(map(len, reported.splitlines())) <= width

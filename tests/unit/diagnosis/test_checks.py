@@ -66,7 +66,7 @@ def readout_of(t_us: NDArray[np.int64], y: NDArray[np.int64] | int = 0, pieces: 
 
 
 @pytest.mark.parametrize(
-    ("tally", "counts", "said"),
+    ("tally", "counts", "message"),
     [
         (NOTHING, {}, ""),
         (FOUND, {"frames": 60, "frames_rejected": 6, "blocks_tried": 6, "blocks_decoded": 1}, ""),
@@ -133,10 +133,10 @@ def readout_of(t_us: NDArray[np.int64], y: NDArray[np.int64] | int = 0, pieces: 
         (tally_of(RANDOM, range=NONE), {"frames_not_ranged": 60}, ""),
     ],
 )
-def test_what_counts_and_frames_say(tally: RunTally, counts: dict[str, int], said: str) -> None:
+def test_what_counts_and_frames_say(tally: RunTally, counts: dict[str, int], message: str) -> None:
     lines = [str(one) for one in find(Facts(LINK, tally, counts))]
-    assert len(lines) == bool(said)
-    assert not said or said in lines[0]
+    assert len(lines) == bool(message)
+    assert not message or message in lines[0]
 
 
 STEPS = "times come in steps of {} ms; a chip is 0.1 ms"
@@ -145,7 +145,7 @@ FLOODED = {"events": 0, "frames": 40, "frames_flooded": 2}
 
 
 @pytest.mark.parametrize(
-    ("verdict", "given", "said"),
+    ("verdict", "given", "message"),
     [
         ("doubt", {"losses": [Loss(200, 0, "byte", "odd")]}, "200 events or words dropped (200 in the file)"),
         ("doubt", {"step_us": 30}, STEPS.format(0.03)),
@@ -161,12 +161,12 @@ FLOODED = {"events": 0, "frames": 40, "frames_flooded": 2}
         ("note", {"counts": FLOODED}, "no symbol in 2 of 40 frames, as all light changed in them"),
     ],
 )
-def test_what_is_said_of_a_recording(verdict: str, given: dict[str, Any], said: str) -> None:
+def test_what_is_reported_of_a_recording(verdict: str, given: dict[str, Any], message: str) -> None:
     facts = Facts(**{"link": LINK, "tally": NOTHING, "counts": {"events": 50_000}} | given)
-    assert [one.text for one in find(facts, verdict)] == [said] * bool(said)
+    assert [one.text for one in find(facts, verdict)] == [message] * bool(message)
 
 
-def test_bars_that_say_the_same_are_doubted_where_it_matters_which_is_which() -> None:
+def test_bars_that_say_the_same_are_uncertain_where_it_matters_which_is_which() -> None:
     counts = {"events": 50_000, "frames_alike": 40}
     for positions, verdict in ({}, "note"), (NO_POSITIONS | {"fixes": 5}, "doubt"):
         found = find(Facts(LINK, NOTHING, counts, positions=positions), verdict)
@@ -174,7 +174,7 @@ def test_bars_that_say_the_same_are_doubted_where_it_matters_which_is_which() ->
 
 
 @pytest.mark.parametrize(
-    ("figures", "decoded", "said"),
+    ("figures", "decoded", "message"),
     [
         ({"beacon_m": LINK.bar.length_m * 1.001}, 0, ""),
         ({"beacon_m": LINK.bar.length_m * 1.25}, 0, "its distances are 20% too short if the beacon is right"),
@@ -186,17 +186,17 @@ def test_bars_that_say_the_same_are_doubted_where_it_matters_which_is_which() ->
         ({"packets": 30, "blocks": 0}, 0, ""),
     ],
 )
-def test_what_the_figures_of_a_transmitter_say(figures: dict[str, Any], decoded: int, said: str) -> None:
+def test_what_the_figures_of_a_transmitter_say(figures: dict[str, Any], decoded: int, message: str) -> None:
     tally = tally_of(RANDOM)
     for name, value in figures.items():
         setattr(tally.transmitters[0], name, value)
     counts = {"blocks_tried": 60, "blocks_decoded": decoded, "blocks_failed": 60 - decoded}
     found = find(Facts(LINK, tally, counts))
-    assert [(said in one.text, one.transmitter) for one in found] == [(True, 0)] * bool(said)
+    assert [(message in one.text, one.transmitter) for one in found] == [(True, 0)] * bool(message)
 
 
 @pytest.mark.parametrize(
-    ("off_px", "said"),
+    ("off_px", "message"),
     [
         ({2: -0.7, 9: 0.6}, "(their sigma 0.1 m): clusters 2, 10 by up to 0.70 px, 0.5 cm at the bar"),
         (dict(enumerate(np.sin(np.arange(15) / 2))), "neighbours alike"),
@@ -204,14 +204,14 @@ def test_what_the_figures_of_a_transmitter_say(figures: dict[str, Any], decoded:
         ({}, ""),
     ],
 )
-def test_a_bent_image(off_px: dict[int, float], said: str) -> None:
+def test_a_bent_image(off_px: dict[int, float], message: str) -> None:
     """Boundary 2, between clusters 2 and 3, is up the bar: cluster 2 lacks light."""
     off_straight_px = np.zeros(15)
     off_straight_px[list(off_px)] = list(off_px.values())
     off_straight_px[5] = np.nan
     tally = tally_of(RANDOM, range=Range(50.0, 0.1, 15, distortion_px=off_straight_px))
     found = find(Facts(LINK, tally, {}))
-    assert [(doubt.code, said in doubt.text) for doubt in found] == [("image-bent", True)] * bool(said)
+    assert [(doubt.code, message in doubt.text) for doubt in found] == [("image-bent", True)] * bool(message)
     # In a few of its frames.
     tally.transmitters[0].bent = 9
     assert not find(Facts(LINK, tally, {}))
@@ -240,7 +240,7 @@ def test_the_modulation_that_was_sent() -> None:
 
 
 @pytest.mark.parametrize(
-    ("start_us", "lit_us", "says"),
+    ("start_us", "lit_us", "expected"),
     [
         (17e3, (17e3, 1.0e6), "nothing after 214 ms, though its light is there until 995 ms"),
         (717e3, (45e3, 9e5), "nothing before 712 ms, though its light is there from 40 ms on"),
@@ -248,13 +248,15 @@ def test_the_modulation_that_was_sent() -> None:
         (17e3, None, None),
     ],
 )
-def test_light_without_frames(start_us: float, lit_us: tuple[float, float] | None, says: str | None) -> None:
+def test_light_without_frames(
+    start_us: float, lit_us: tuple[float, float] | None, expected: str | None
+) -> None:
     """Six packets of 34.6 ms, the last frame 31.4 ms before their end, in a recording of a second."""
     tally = tally_of(RANDOM, every_us=3200.0, start_us=start_us)
     facts = Facts(LINK, tally, {}, 5e3, 1.005e6, None if lit_us is None else {0: lit_us})
     found = find(facts)
-    assert [doubt.code for doubt in found] == ["coverage"] * (says is not None)
-    assert says is None or found[0].text == says
+    assert [doubt.code for doubt in found] == ["coverage"] * (expected is not None)
+    assert expected is None or found[0].text == expected
     # Where nothing is received is said in any case, but a road without bars is nothing wrong.
     (note,) = find(facts, "note")
     ms = round((start_us - 5e3) / 1e3)
@@ -309,12 +311,12 @@ NO_SITE = {"refused": {"no-site": 4}, "heard": {"0": 9, "1": 7, "2": 9}}
 
 def known(strange: list[int], unseen: list[int]) -> dict[str, Any]:
     """Positions of a bar with the id 7, beside others that are in no site, and sites that are not seen."""
-    heard = {str(number): one for number, one in enumerate([7, *strange])}
-    return {"fixes": 9, "bars": {"0": 7}, "heard": heard, "sites_unseen": unseen}
+    reported = {str(number): one for number, one in enumerate([7, *strange])}
+    return {"fixes": 9, "bars": {"0": 7}, "heard": reported, "sites_unseen": unseen}
 
 
 @pytest.mark.parametrize(
-    ("code", "positions", "said"),
+    ("code", "positions", "message"),
     [
         ("no-site", NO_SITE, "received: ids 7, 9: compare"),
         # A bar more beside those that are known is none.
@@ -337,7 +339,7 @@ def known(strange: list[int], unseen: list[int]) -> dict[str, Any]:
         ("learnt", learnt("bar 2", "east_m", -0.9, 0.02), "shows bar 2, east_m, -0.9 off what is stated,"),
     ],
 )
-def test_what_positions_say(code: str, positions: dict[str, Any], said: str) -> None:
+def test_what_positions_say(code: str, positions: dict[str, Any], message: str) -> None:
     link = load_link(overrides=["camera_sigma.focal_mm=0.2"])
     found = find(Facts(link, NOTHING, {}, positions=NO_POSITIONS | positions))
-    assert [said in str(one) for one in found if one.code == code] == [True] * bool(said)
+    assert [message in str(one) for one in found if one.code == code] == [True] * bool(message)

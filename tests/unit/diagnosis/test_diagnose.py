@@ -113,7 +113,7 @@ def test_parts_of_a_near_bar_are_no_frames_of_another() -> None:
     assert summary["warnings"] == []
 
 
-def test_a_restart_is_told_in_words() -> None:
+def test_a_restart_is_reported_in_words() -> None:
     old = {"pole_s": [[0.07, 9.0]], "seed": 1, "start_chip": 40.3, "ppm": 11.0}
     new = {"pole_s": [[0.0, 0.0702]], "seed": 2, "start_chip": 343.7}
     summary = receive_to_folder(simulate({"duration_s": 0.16, "bars": [old, new]}, seed=3), None)
@@ -205,7 +205,7 @@ LAMP = (
 
 
 @pytest.mark.parametrize("dark", [False, True])
-def test_a_framing_without_a_preamble_is_judged_by_its_frames(dark: bool) -> None:
+def test_a_framing_without_a_preamble_is_assessed_by_its_frames(dark: bool) -> None:
     scene, link = {"motion.distance_m": 30.0}, load_link(overrides=LAMP)
     scene |= {"bars.0.led_w_m2": 0.0} if dark else {}
     with rendered(LAMP, 0.08, **scene) as source:
@@ -229,8 +229,10 @@ def survey_of(times_us: NDArray[np.float64]) -> LightSurvey:
     return survey
 
 
-@pytest.mark.parametrize(("speed_px_ms", "said"), [(12.0, "sweeps over the image at 12.0 px/ms"), (0.0, "")])
-def test_light_that_sweeps_is_not_said_to_be_weak(speed_px_ms: float, said: str) -> None:
+@pytest.mark.parametrize(
+    ("speed_px_ms", "message"), [(12.0, "sweeps over the image at 12.0 px/ms"), (0.0, "")]
+)
+def test_light_that_sweeps_is_not_reported_to_be_weak(speed_px_ms: float, message: str) -> None:
     rng = np.random.default_rng(2)
     survey = LightSurvey(1280, 720)
     for start_us in range(0, 100_000, 10_000):
@@ -241,8 +243,8 @@ def test_light_that_sweeps_is_not_said_to_be_weak(speed_px_ms: float, said: str)
     link = load_link()
     facts = Facts(link, RunTally(link.packet), {"events": 200_000}, surveyed=True, speed_px_ms=speed_px_ms)
     light = next(one for one in find_stages(facts) if one.stage == "light")
-    assert (light.verdict, light.code) == ("fail", "motion" if said else "dark")
-    assert said in light.text
+    assert (light.verdict, light.code) == ("fail", "motion" if message else "dark")
+    assert message in light.text
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 1000.0, 2375.0, 5000.0, 10_000.0])
@@ -320,17 +322,19 @@ def test_command_says_it_in_words_as_json_and_on_a_page(tmp_path: Path) -> None:
     text = page.read_text()
     assert "http" not in text.replace("http-equiv", "")
     assert text.count("data:image/png;base64,") == 2
-    told = json.loads(run("diagnose", recording, "--json").stdout)
-    assert [one["code"] for one in told["checks"] if one["verdict"] == "fail"] == ["rate"]
-    (bar,) = told["sources"]
+    result = json.loads(run("diagnose", recording, "--json").stdout)
+    assert [one["code"] for one in result["checks"] if one["verdict"] == "fail"] == ["rate"]
+    (bar,) = result["sources"]
     assert (bar["kind"], bar["rate_hz"]) == ("code", pytest.approx(8000, rel=3e-3))
     # 0.96 m of 7202 px at 50 m.
     assert bar["size_px"][1] == pytest.approx(0.96 * 7202 / 50, abs=8)
 
 
 def test_receive_takes_the_link_that_fits(tmp_path: Path) -> None:
-    told = run("receive", written(tmp_path, ("modulation.id=wh8",)), "-o", tmp_path / "out", "--link", "auto")
-    assert "link --set modulation.id=wh8" in told.stderr
+    reported = run(
+        "receive", written(tmp_path, ("modulation.id=wh8",)), "-o", tmp_path / "out", "--link", "auto"
+    )
+    assert "link --set modulation.id=wh8" in reported.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["codebook"]["profile"] == "wh8"
 

@@ -114,7 +114,7 @@ def test_a_driver_that_begins_anew(packets, tmp_path):
     same_as_the_recording(write_sqlite(tmp_path / "a.db3", messages, range(999)))
 
 
-def test_what_is_wrong_with_a_bag_is_said(tmp_path):
+def test_what_is_wrong_with_a_bag_is_reported(tmp_path):
     message = packed((0, np.array([0x8001, 0x6000, 0x0005, 0x2007], "<u2").tobytes()))
     write_sqlite(tmp_path / "two.db3", [message], [0], topics=2)
     write_sqlite(tmp_path / "none.db3", [], [], topics=0)
@@ -123,7 +123,7 @@ def test_what_is_wrong_with_a_bag_is_said(tmp_path):
     write_sqlite(tmp_path / "good.db3", [message], [0])
     (tmp_path / "no.bag").write_bytes(b"nothing of the kind")
     (tmp_path / "empty").mkdir()
-    for name, told in (
+    for name, wanted in (
         ("two.db3", "2 topics of type event_camera_msgs/EventPacket"),
         ("none.db3", "no topic of type event_camera_msgs/EventPacket (topics: none)"),
         ("good.db3?topic=/imu", "topic '/imu', expected one of type EventPacket"),
@@ -133,7 +133,7 @@ def test_what_is_wrong_with_a_bag_is_said(tmp_path):
         ("empty", "a folder without .db3 or .mcap files"),
         ("gone", "No such file"),
     ):
-        with pytest.raises(InputError, match=re.escape(told)):
+        with pytest.raises(InputError, match=re.escape(wanted)):
             open_source(f"bag:{tmp_path / name}")
 
 
@@ -143,16 +143,16 @@ def test_a_bag_that_is_written_is_read_back(demo_raw, tmp_path, evlcp):
     path = tmp_path / "a.mcap"
     edges = Triggers.of([5, 12_345, 70_000], [0, 0, 1], [1, 0, 1])
     with open_source(demo_raw) as source, open_writer(path, 1280, 720) as writer:
-        told, _ = source.read()
-        cut = len(told) // 3
-        edge = int(np.searchsorted(edges.t_us, told.t_us[cut]))
-        for events, triggers in ((told[:cut], edges[:edge]), (told[cut:], edges[edge:])):
+        reported, _ = source.read()
+        cut = len(reported) // 3
+        edge = int(np.searchsorted(edges.t_us, reported.t_us[cut]))
+        for events, triggers in ((reported[:cut], edges[:edge]), (reported[cut:], edges[edge:])):
             writer.write(events, triggers)
     with open_source(path) as source:
         got, ticks = source.read()
         assert (source.format, source.width, source.height, source.losses) == ("BAG", 1280, 720, {})
     for name in ("t_us", "x", "y", "p"):
-        assert (getattr(got, name) == getattr(told, name)).all()
+        assert (getattr(got, name) == getattr(reported, name)).all()
     assert ticks.t_us.tolist() == edges.t_us.tolist()
 
     from mcap.reader import make_reader
@@ -176,19 +176,19 @@ def test_a_bag_that_is_written_is_read_back(demo_raw, tmp_path, evlcp):
     assert seqs == list(range(len(seqs)))
     assert len(seqs) >= 8
     (tmp_path / "words.raw").write_bytes(b"% evt 3.0\n% geometry 1280x720\n% end\n" + words)
-    assert (read_events(tmp_path / "words.raw").t_us == told.t_us).all()
+    assert (read_events(tmp_path / "words.raw").t_us == reported.t_us).all()
 
     done = evlcp("convert", path, "-o", tmp_path / "back.raw", "--json")
     assert done.code == 0, done.err
-    assert json.loads(done.out)["counts"] == {"events": len(told), "triggers": 3}
-    assert (read_events(tmp_path / "back.raw").x == told.x).all()
+    assert json.loads(done.out)["counts"] == {"events": len(reported), "triggers": 3}
+    assert (read_events(tmp_path / "back.raw").x == reported.x).all()
 
 
 def test_a_command_that_converts_says_what_is_wrong(tmp_path, evlcp):
     raw, npz, cut = (tmp_path / name for name in ("a.raw", "a.npz", "cut.csv"))
     write_events(raw, Events.of(range(1200), range(1200), [5] * 1200, [1] * 1200), 1280, 720)
     cut.write_text("t_us,x,y,p\n1,2,3,1\n2,3,what,0\n")
-    for arguments, code, told in (
+    for arguments, code, wanted in (
         ([raw, "-o", npz], 0, f"{npz}: 1,200 events, 0 triggers\n"),
         ([npz, "-o", raw], 0, f"{raw}: 1,200 events, 0 triggers\n"),
         ([raw, "-o", tmp_path / "a.txt"], 1, "suffix '.txt', expected .raw, .npz, .csv"),
@@ -198,11 +198,11 @@ def test_a_command_that_converts_says_what_is_wrong(tmp_path, evlcp):
         ([cut, "--size", "1280x720", "-o", tmp_path / "cut.raw"], 3, "line 3"),
     ):
         done = evlcp("convert", *arguments)
-        assert (done.code, told in done.out + done.err) == (code, True), done.err
+        assert (done.code, wanted in done.out + done.err) == (code, True), done.err
     assert (tmp_path / "cut.raw").exists()
 
 
-def test_what_is_wrong_with_hdf5_is_said(tmp_path):
+def test_what_is_wrong_with_hdf5_is_reported(tmp_path):
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["images"] = file["other"] = np.zeros(3)
@@ -216,11 +216,11 @@ def test_what_is_wrong_with_hdf5_is_said(tmp_path):
         kind = h5py.h5t.py_create(np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")]))
         group = file.create_group("CD")
         h5py.h5d.create(group.id, b"events", kind, h5py.h5s.create_simple((4,), (4,)), dcpl=plist)
-    for name, told in (
+    for name, wanted in (
         ("other.h5", "found images, other, expected /events or /raw_events or /CD/events"),
         ("table.h5", "say which columns they are, as by hdf5:PATH?columns=txyp"),
         ("table.h5?columns=txy", "columns = 'txy': expected the letters t, x, y and p"),
         ("ecf.h5", "compressed by ECF, Prophesee's own codec"),
     ):
-        with pytest.raises(InputError, match=re.escape(told)):
+        with pytest.raises(InputError, match=re.escape(wanted)):
             open_source(f"hdf5:{tmp_path / name}")

@@ -166,8 +166,8 @@ def test_standard_input_is_a_recording(tmp_path):
     path = raw(tmp_path / "a.raw", GOOD * 100)
     command = [sys.executable, "-c", "from evlcp_sdk.cli.main import main; main()", "info", "-", "--json"]
     with path.open("rb") as file:
-        told = json.loads(subprocess.run(command, stdin=file, capture_output=True, check=True).stdout)
-    assert (told["path"], told["counts"]["events"]) == ("standard input", 100)
+        result = json.loads(subprocess.run(command, stdin=file, capture_output=True, check=True).stdout)
+    assert (result["path"], result["counts"]["events"]) == ("standard input", 100)
     inside, outside = pty.openpty()
     done = subprocess.run(command, stdin=outside, capture_output=True, text=True, check=False)
     os.close(inside)

@@ -174,7 +174,7 @@ def test_two_arrays_without_names(tmp_path):
 
 @pytest.mark.parametrize("on_its_side", [False, True])
 @pytest.mark.parametrize("order", ["txyp", "xypt", "ptyx"])
-def test_columns_of_an_hdf5_table_are_told(order, on_its_side, tmp_path):
+def test_columns_of_an_hdf5_table_are_reported(order, on_its_side, tmp_path):
     path = tmp_path / "a.h5"
     write_hdf5(path, {"events": table(order).T if on_its_side else table(order)})
     expect(f"hdf5:{path}?columns={order}", placed=True)
@@ -216,7 +216,7 @@ def test_times_to_the_millisecond_say_their_unit(form, many, first_us, tmp_path)
 
 
 @pytest.mark.parametrize(("digits", "words"), [(3, "1 ms"), (4, "100 us")])
-def test_rounded_times_are_said(digits, words, tmp_path):
+def test_rounded_times_are_reported(digits, words, tmp_path):
     (tmp_path / "a.csv").write_text(text(T_S, P, head="t,p", form=f"%.{digits}f"))
     with open_source(f"list:{tmp_path / 'a.csv'}?unit=s") as source:
         assert source.header["step"] == f"times are rounded to {words}"
@@ -230,14 +230,14 @@ def test_times_coarser_than_a_chip_are_warned_of(tmp_path, evlcp):
     assert "times come in steps of 1 ms; a chip is 0.1 ms" in " ".join(done.out.split())
 
 
-def test_a_light_that_blinks_in_another_unit_than_named_is_said(tmp_path):
+def test_a_light_that_blinks_in_another_unit_than_named_is_reported(tmp_path):
     t_us = np.arange(80_000) // 1000 * 100 + np.arange(80_000) % 1000 // 50
-    for unit, said in (("ns", "in us a light would blink"), ("us", "")):
+    for unit, expected in (("ns", "in us a light would blink"), ("us", "")):
         lines = [f"{t},{t % 2}" for t in t_us.tolist()]
         (tmp_path / "a.csv").write_text("\n".join([f"t_{unit},p", *lines]))
         with open_source(tmp_path / "a.csv") as source:
-            assert said in source.guessed
-            assert bool(source.guessed) == bool(said)
+            assert expected in source.guessed
+            assert bool(source.guessed) == bool(expected)
 
 
 @pytest.mark.parametrize("before_us", [200, 7000])
@@ -286,7 +286,7 @@ def test_rows_that_are_no_number_are_dropped_and_counted(tmp_path, evlcp):
     assert "150 events or words, 5.0%, were dropped" in " ".join((done.out + done.err).split())
 
 
-def test_what_a_list_does_not_say_is_told(tmp_path):
+def test_what_a_list_does_not_say_is_reported(tmp_path):
     (tmp_path / "a.csv").write_text(text(ROWS % 7, SIGNS, T_US))
     events = read_events(f"list:{tmp_path / 'a.csv'}?columns=-,p,t&unit=ms&inverted=1")
     np.testing.assert_array_equal(events.t_us, T_US * 1000)

@@ -113,7 +113,7 @@ def test_a_read_ends_when_the_source_is_closed(recording):
 
 
 @pytest.mark.parametrize(
-    ("url", "told"),
+    ("url", "message"),
     [
         ("tcp://localhost:1", "Connection refused; expected a program that sends there"),
         ("tcp://localhost", "expected tcp://HOST:PORT"),
@@ -123,11 +123,11 @@ def test_a_read_ends_when_the_source_is_closed(recording):
         ("tcp://localhost:1?evt=4", "evt = '4': expected 2 or 3"),
     ],
 )
-def test_what_is_wrong_with_a_stream_is_said(url, told):
+def test_what_is_wrong_with_a_stream_is_reported(url, message):
     with pytest.raises(InputError) as fault:
         open_source(url)
     assert str(fault.value).startswith(url)
-    assert told in str(fault.value)
+    assert message in str(fault.value)
 
 
 def test_a_pipe_in_the_dark_is_opened_at_once(recording):

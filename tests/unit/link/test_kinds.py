@@ -66,20 +66,20 @@ def test_a_time_and_a_countdown() -> None:
     assert payload == (1795337776123456).to_bytes(8, "little")
     assert TimeKind().unpack(payload) == pytest.approx(now.timestamp(), abs=1e-6)
     assert TimeKind().to_dict(now.timestamp())["time"] == "2026-11-22T08:56:16.123+00:00"
-    said = Countdown("red", "green", 12.3)
-    payload = CountdownKind().pack(said)
+    reported = Countdown("red", "green", 12.3)
+    payload = CountdownKind().pack(reported)
     assert payload == bytes([1, 4]) + (12_300).to_bytes(4, "little")
-    assert CountdownKind().unpack(payload) == said
-    assert CountdownKind().to_dict(said) == {"signal": "red", "next_signal": "green", "left_s": 12.3}
+    assert CountdownKind().unpack(payload) == reported
+    assert CountdownKind().to_dict(reported) == {"signal": "red", "next_signal": "green", "left_s": 12.3}
     for value in (-1.0, float("nan"), float("inf"), 3e11):
         with pytest.raises(ConfigError, match=r"time: .* s, expected seconds since 1970"):
             TimeKind().pack(value)
-    for wrong, says in (
+    for wrong, expected in (
         (Countdown("blue", "red", 1.0), r"signal = 'blue', expected one of dark, red"),
         (Countdown("red", "red", -0.1), r"expected 0 to 86400"),
         (Countdown("red", "red", float("nan")), r"expected 0 to 86400"),
     ):
-        with pytest.raises(ConfigError, match=says):
+        with pytest.raises(ConfigError, match=expected):
             CountdownKind().pack(wrong)
     for kind, data in ((TimeKind(), bytes(7)), (TimeKind(), b"\xff" * 8), (CountdownKind(), bytes(5))):
         with pytest.raises(BlockError):

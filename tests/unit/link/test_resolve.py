@@ -87,7 +87,7 @@ def test_an_override_of_another_form(registry: Registry, override: str) -> None:
         load_link(None, [override], registry)
 
 
-def test_every_fault_of_a_file_is_told(registry: Registry, tmp_path: Path) -> None:
+def test_every_fault_of_a_file_is_reported(registry: Registry, tmp_path: Path) -> None:
     text = """
     camra.width = 3
     decoding = 4
@@ -172,17 +172,17 @@ def test_the_text_tells_meaning_unit_bounds_and_default(registry: Registry) -> N
 
 
 @pytest.mark.parametrize(
-    ("setting", "says"),
+    ("setting", "message"),
     [
         ("bar.led_pitch_m=1e-308", "expected greater than or equal to 0.000001"),
         ("bar.columns=4096", "bar.rows = 96, bar.columns = 4096: expected at most 65536 LEDs"),
         ("air.chip_rate_hz=1e-300", "expected greater than or equal to 1"),
     ],
 )
-def test_sizes_that_no_memory_or_number_holds_are_refused(setting: str, says: str) -> None:
+def test_sizes_that_no_memory_or_number_holds_are_refused(setting: str, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         load_link(overrides=[setting])
-    assert str(caught.value).endswith(says)
+    assert str(caught.value).endswith(message)
 
 
 ONE_LED = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
@@ -203,11 +203,11 @@ def test_a_wrong_value_is_refused_by_its_name(link: Mapping[str, Any], sections:
         for key in table[section]:
             for value in WRONG:
                 changed = {**link, section: {**link.get(section, {}), key: value}}
-                said = refusal(lambda: resolve(changed, registry=registry)) or ""  # noqa: B023
-                tried, refused = tried + 1, refused + bool(said)
+                reported = refusal(lambda: resolve(changed, registry=registry)) or ""  # noqa: B023
+                tried, refused = tried + 1, refused + bool(reported)
                 named = f"no {section} algorithm named" if (key, value) == ("id", "x") else key
                 # One line; of a list, one for each of its values.
-                assert all(named in line for line in said.splitlines()), (section, key, value)
+                assert all(named in line for line in reported.splitlines()), (section, key, value)
                 if isinstance(value, float) and not math.isfinite(value):
-                    assert said, (section, key, value)
+                    assert reported, (section, key, value)
     assert refused > tried / 2

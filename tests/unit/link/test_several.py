@@ -34,8 +34,8 @@ def test_a_setting_changes_all_links_or_the_one_that_it_names(files: list[Path])
 
 
 def test_a_setting_of_no_link_is_refused(files: list[Path]) -> None:
-    says = r"^--set fra\.ranging\.id=poc: no link is named 'fra': .* bar, far"
-    with pytest.raises(ConfigError, match=says):
+    message = r"^--set fra\.ranging\.id=poc: no link is named 'fra': .* bar, far"
+    with pytest.raises(ConfigError, match=message):
         load_links(files, ["fra.ranging.id=poc"])
 
 
@@ -77,8 +77,8 @@ def test_links_whose_characters_the_other_reads_are_named(tmp_path, capsys, rate
     assert alike_links(named_links(load_links(files))) == [("lamp", "other")] * alike
     # It is said on stderr before anything is read.
     LinkOptions([*map(str, files)]).load(Registry.load())
-    says = "evlcp: warning: what one of the links 'lamp' and 'other' sends, the other may read"
-    assert [line.startswith(says) for line in capsys.readouterr().err.splitlines()] == [True] * alike
+    message = "evlcp: warning: what one of the links 'lamp' and 'other' sends, the other may read"
+    assert [line.startswith(message) for line in capsys.readouterr().err.splitlines()] == [True] * alike
 
 
 @pytest.mark.parametrize(
@@ -122,8 +122,8 @@ def test_another_revision_is_named() -> None:
     link, other = resolve({}), resolve({"modulation": {"id": "wh8"}})
     codes = replace(link.codebook, codewords=other.codebook.codewords)
     newer = replace(link, codebook=codes, revisions={**link.revisions, "modulation": 9}, digest="0")
-    says = ('modulation.id = "wh4x2": sent with revision 9, received with revision 1',)
-    assert differences(newer, link) == says
+    reported = ('modulation.id = "wh4x2": sent with revision 9, received with revision 1',)
+    assert differences(newer, link) == reported
 
 
 def test_codes_that_differ_in_silence_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,8 +134,8 @@ def test_codes_that_differ_in_silence_are_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(WhPilots, "codes", lambda self, clusters: codes(self, clusters)[::-1].copy())
     theirs = resolve({})
     assert not np.array_equal(ours.codebook.pilots, theirs.codebook.pilots)
-    (says,) = differences(ours, theirs)
-    assert says == 'pilots.id = "wh": sent with other codes than those received with'
+    (result,) = differences(ours, theirs)
+    assert result == 'pilots.id = "wh": sent with other codes than those received with'
 
 
 def test_a_link_survives_pickling_and_is_equal_by_its_digest() -> None:

@@ -54,9 +54,9 @@ def test_quantiles_are_those_of_numpy_to_two_percent() -> None:
     for share in (0.01, 0.5, 0.99, 1.0):
         expected = np.quantile(delays_ms, share, method="inverted_cdf")
         assert expected * 0.999 <= tally.quantile_ms(share) <= expected * 1.021
-    told = tally.to_dict()
-    assert told["count"] == 5000
-    assert told["max_ms"] == round(float(delays_ms.max()), 3)
+    reported = tally.to_dict()
+    assert reported["count"] == 5000
+    assert reported["max_ms"] == round(float(delays_ms.max()), 3)
     assert DelayTally().to_dict()["p50_ms"] is None
 
 
@@ -72,12 +72,12 @@ def test_a_picture_is_read_back(size: tuple[int, int], density: float) -> None:
         image.paint(events)
         paint(cells, events)
     assert (image.cells == cells).all()
-    told = image.png()
-    with Image.open(io.BytesIO(told)) as picture:
+    reported = image.png()
+    with Image.open(io.BytesIO(reported)) as picture:
         picture.load()
         assert picture.mode == "P"
         assert (np.array(picture) == cells).all()
-        assert told[24] == 2, "bits a pixel"
+        assert reported[24] == 2, "bits a pixel"
         assert picture.getpalette()[:12] == [16, 16, 20, 70, 150, 255, 255, 205, 70, 235, 235, 235]
     image.clear()
     assert not image.cells.any()

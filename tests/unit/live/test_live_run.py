@@ -68,8 +68,8 @@ def test_a_replay_gives_what_the_file_gives(demo_raw, tmp_path, capsys) -> None:
     assert shed == f"{text}; rows outside of regions are shed, and distances of most frames"
     show(summary, None)
     total = summary["live"]["delays"]["total"]
-    told = f"delay of {total['count']} frames, from the last chip: p50 {total['p50_ms']:.1f}, p99"
-    assert told in capsys.readouterr().out
+    message = f"delay of {total['count']} frames, from the last chip: p50 {total['p50_ms']:.1f}, p99"
+    assert message in capsys.readouterr().out
 
 
 def test_frames_of_several_links_name_theirs(demo_raw: Path) -> None:
@@ -98,8 +98,8 @@ def test_pulses_of_a_recording_say_what_utc_it_is(tmp_path: Path, evlcp: Callabl
     assert json.loads(done.out)["pps"] == counted
     done = evlcp("receive", tmp_path / "pps.raw", "-o", tmp_path / "out", "--pps", "9", *given[2:4])
     assert done.code == 0, done.err
-    said = " ".join((done.out + done.err).split())
-    assert "no pulse of UTC came on channel 9 of the trigger input; on others something came: 0" in said
+    message = " ".join((done.out + done.err).split())
+    assert "no pulse of UTC came on channel 9 of the trigger input; on others something came: 0" in message
     done = evlcp("receive", tmp_path / "pps.raw", "-o", tmp_path / "out", "--pps", "0")
     assert done.code == 2
     assert "a pulse says when a second of UTC begins, not which one: give --clock-zero" in done.err
@@ -250,7 +250,7 @@ def test_the_command(evlcp: Callable[..., Any], demo_raw: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("url", "told"),
+    ("url", "message"),
     [
         ("replay:{}?speed=0", "speed = '0': expected a number above 0"),
         ("replay:{}?sped=2", "option 'sped'; did you mean 'speed'?"),
@@ -260,10 +260,10 @@ def test_the_command(evlcp: Callable[..., Any], demo_raw: Path) -> None:
         ("replay:", "expected replay:REC"),
     ],
 )
-def test_what_is_wrong_with_a_replay_is_said(url: str, told: str, demo_raw: Path) -> None:
+def test_what_is_wrong_with_a_replay_is_reported(url: str, message: str, demo_raw: Path) -> None:
     with pytest.raises(InputError) as fault:
         open_source(url.format(demo_raw))
-    assert told in str(fault.value)
+    assert message in str(fault.value)
 
 
 def test_what_the_page_is_asked_for_needs_a_page(evlcp: Callable[..., Any], demo_raw: Path) -> None:

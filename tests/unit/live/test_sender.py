@@ -54,7 +54,7 @@ def test_what_is_sent_is_received(recording: Path, tmp_path: Path) -> None:
     assert sender.counts["events"] == len(EVENTS)
 
 
-def test_where_it_cannot_listen_is_said(recording: Path) -> None:
+def test_where_it_cannot_listen_is_reported(recording: Path) -> None:
     with socket.create_server(("localhost", 0)) as taken, open_source(recording) as source:
         port = taken.getsockname()[1]
         with pytest.raises(OutputError, match=f"localhost:{port}: cannot listen: Address already in use"):
@@ -79,7 +79,7 @@ def test_the_command(evlcp: Callable[..., Any], recording: Path, tmp_path: Path)
     thread.join(10)
     assert (run.code, got) == (0, [len(EVENTS)])
     assert "to whoever connects to unix:" in run.err
-    for options, told in (((), "give --tcp PORT"), (("--tcp", "x:y"), "expected PORT or HOST:PORT")):
+    for options, expected in (((), "give --tcp PORT"), (("--tcp", "x:y"), "expected PORT or HOST:PORT")):
         run = evlcp("serve", recording, *options)
         assert run.code == 2
-        assert told in run.err
+        assert expected in run.err

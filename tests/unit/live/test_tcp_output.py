@@ -37,10 +37,10 @@ def test_nmea_has_the_time_of_day_where_no_other_is_known(served) -> None:
                 got += link.recv(1 << 16)
     sentences = [pynmea2.parse(line, check=True) for line in got.decode().splitlines()[:15]]
     assert [one.sentence_type for one in sentences[:5]] == ["TXT", "GGA", "RMC", "GST", "GBS"]
-    told = [datetime.combine(one.datestamp, one.timestamp) for one in sentences[2::5]]
+    reported = [datetime.combine(one.datestamp, one.timestamp) for one in sentences[2::5]]
     # The very first fix was just now, as its camera's clock was first heard of then.
-    assert 0 < (told[0].replace(tzinfo=UTC) - datetime.now(UTC)).total_seconds() + 60 < n + 60
-    assert [(at - told[0]).total_seconds() for at in told] == [0, 1, 2]
+    assert 0 < (reported[0].replace(tzinfo=UTC) - datetime.now(UTC)).total_seconds() + 60 < n + 60
+    assert [(at - reported[0]).total_seconds() for at in reported] == [0, 1, 2]
     assert [float(one.altitude) + float(one.geo_sep) for one in sentences[1::5]] == pytest.approx([60.0] * 3)
 
 

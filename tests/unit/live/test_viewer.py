@@ -137,9 +137,9 @@ def test_a_credit_a_bundle(stage: Stage) -> None:
         with pytest.raises(TimeoutError):
             link.recv(0.2)
         head, picture = next_of(link)
-        (told,) = head["news"]
-        assert (told["line"], told["t_us"], told["late_ms"]) == ("frame", FRAMES[0].t_us, 2.5)
-        assert told["symbols"] == FRAMES[0].soft.symbols.tolist()
+        (reported,) = head["news"]
+        assert (reported["line"], reported["t_us"], reported["late_ms"]) == ("frame", FRAMES[0].t_us, 2.5)
+        assert reported["symbols"] == FRAMES[0].soft.symbols.tolist()
         assert (head["picture"], picture) == (None, b"")
         link.send('{"next": true}')
         # One is drawn once it is asked for.
@@ -182,7 +182,7 @@ def test_one_that_stalls_costs_the_others_nothing(stage: Stage) -> None:
         assert stage.view.dropped == 2000
 
 
-def test_what_was_before_is_told_to_who_comes_later(stage: Stage) -> None:
+def test_what_was_before_is_shown_to_who_comes_later(stage: Stage) -> None:
     fix = Fix.from_refusal(5e3, (0,), "misfit", "why")
     stage.publisher.publish("fix", fix.t_us, Placed(fix, None))
     enu_m, unit = np.array([3.0, -20.0, -1.0]), np.eye(3)
@@ -220,10 +220,10 @@ def test_a_message_that_cannot_be_shown_says_why(stage: Stage) -> None:
 
 
 def test_browsers_only_look_on(stage: Stage) -> None:
-    for said in ('{"record": true}', "{", '{"next": 2}', "[]", "x" * 5000):
+    for entry in ('{"record": true}', "{", '{"next": 2}', "[]", "x" * 5000):
         with stage.connect() as link:
             link.recv(30)
-            link.send(said)
+            link.send(entry)
             with pytest.raises(ConnectionClosedError, match=r"1008|1009"):
                 link.recv(30)
 
@@ -263,8 +263,8 @@ def test_what_was_recorded_stays_where_a_recording_has_to_end(why, tmp_path, mon
         monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=7_000_000))
     publish(publisher, 3_000 if why == "disk" else 1_000)
     until(lambda: not recorder.state["recording"])
-    told = {"disk": "7 MB are left on the disk: expected 100", "clock": "event at 1000 us after 2009 us"}
-    assert told[why] in recorder.state["fault"]
+    reported = {"disk": "7 MB are left on the disk: expected 100", "clock": "event at 1000 us after 2009 us"}
+    assert reported[why] in recorder.state["fault"]
     with open_source(tmp_path / recorder.state["file"]) as source:
         assert len(source.read()[0]) == (20 if why == "disk" else 10)
 
@@ -285,8 +285,8 @@ def test_who_has_asked_nothing_yet_is_left_at_the_end() -> None:
 
 
 def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
-    told = rf"127.0.0.1:{stage.view.port}: .*expected an address of this machine and a port"
-    with pytest.raises(ConfigError, match=told), staged(port=stage.view.port):
+    reported = rf"127.0.0.1:{stage.view.port}: .*expected an address of this machine and a port"
+    with pytest.raises(ConfigError, match=reported), staged(port=stage.view.port):
         pass
 
 

@@ -29,7 +29,7 @@ def views(rng, count, known, noise_px=0.1, bars=6) -> list[CalibrationView]:
         attitude = Attitude(rng.uniform(-10, 10), rng.choice([0, 90, -90, 180]) + rng.uniform(-5, 5), 0.0)
         attitude = dataclasses.replace(attitude, heading_deg=rng.uniform(-15, 15))
         place, rotation = rng.uniform(-1, 1, 3), attitude.rotation()
-        said = place + rng.normal(0, 0.005, 3)
+        reported = place + rng.normal(0, 0.005, 3)
         turned = Rotation.from_rotvec(np.radians(rng.normal(0, 0.05, 3))).as_matrix() @ rotation
         seen = []
         for i, pole in enumerate(poles):
@@ -39,7 +39,7 @@ def views(rng, count, known, noise_px=0.1, bars=6) -> list[CalibrationView]:
                 points = points + rng.normal(0, noise_px, points.shape)
                 seen.append(BarView(i, pole, points, np.full(16, noise_px)))
         if len(seen) >= 2:
-            found.append(CalibrationView(tuple(seen), said, 0.005, turned if known else None, 0.05))
+            found.append(CalibrationView(tuple(seen), reported, 0.005, turned if known else None, 0.05))
     return found
 
 
@@ -73,15 +73,15 @@ def test_sites_that_are_not_exact_are_in_the_covariance() -> None:
     for _ in range(6):
         seen = views(rng, 10, True)
         off = {one.transmitter: rng.normal(size=7) for view in seen for one in view.bars}
-        told = []
+        reports = []
         for view in seen:
             bars = []
             for one in view.bars:
                 z, arm = off[one.transmitter], one.enu_m - one.enu_m.mean(0)
                 moved = survey[0] * z[:3] + np.cross(survey[1] * z[3:6], arm) + survey[2] * z[6] * arm
                 bars.append(dataclasses.replace(one, enu_m=one.enu_m + moved, survey=survey))
-            told.append(dataclasses.replace(view, bars=tuple(bars)))
-        found = calibrate(told, NOMINAL, POINTS_ONLY)
+            reports.append(dataclasses.replace(view, bars=tuple(bars)))
+        found = calibrate(reports, NOMINAL, POINTS_ONLY)
         exact = calibrate(seen, NOMINAL, POINTS_ONLY)
         spreads.append(found.sigma["focal_mm"] / exact.sigma["focal_mm"])
         squares += squares_of(found)
@@ -119,14 +119,14 @@ def test_what_one_bar_does_not_determine_is_refused() -> None:
         calibrate([dataclasses.replace(seen[0], bars=())], NOMINAL, POINTS_ONLY)
 
 
-def test_a_pose_that_is_not_right_is_told_and_not_the_lens() -> None:
+def test_a_pose_that_is_not_right_is_reported_and_not_the_lens() -> None:
     """One of eight, or all of them in another town."""
     seen = views(np.random.default_rng(3), 8, True)
     wrong = dataclasses.replace(seen[2], enu_m=seen[2].enu_m + np.array([0.5, 0, 0]))
     away = [dataclasses.replace(v, enu_m=v.enu_m + np.array([0, 111e3, 0])) for v in seen[:4]]
-    for told in ([*seen[:2], wrong, *seen[3:]], away):
+    for row in ([*seen[:2], wrong, *seen[3:]], away):
         with pytest.raises(ConfigError, match="not as was said"):
-            calibrate(told, NOMINAL, POINTS_ONLY)
+            calibrate(row, NOMINAL, POINTS_ONLY)
 
 
 def test_angles_that_are_all_wrong_are_not_the_principal_point() -> None:
@@ -153,7 +153,7 @@ def test_the_slope_of_a_turn_is_the_numerical_one(turn: NDArray[np.float64]) -> 
     np.testing.assert_allclose(_turn_slope(turn), want, atol=1e-6)
 
 
-def test_poses_are_read_and_their_faults_told(tmp_path: Path) -> None:
+def test_poses_are_read_and_their_faults_reported(tmp_path: Path) -> None:
     path = tmp_path / "poses.csv"
     head = "recording,t_us,latitude_deg,longitude_deg,height_m,heading_deg,pitch_deg,roll_deg\n"
     path.write_text(head + "a.raw,5000,35,137,5,,,\nb.raw,6000,35,137,5,350,1,2\n")
@@ -163,7 +163,7 @@ def test_poses_are_read_and_their_faults_told(tmp_path: Path) -> None:
     # As spreadsheets write it.
     path.write_text(path.read_text(), encoding="utf-8-sig")
     assert read_poses(path) == [one, two]
-    for text, says in (
+    for text, message in (
         (head, "one line of values or more"),
         (head + "a.raw,,35,137,5,,,\n", r"line 2: t_us = '': expected a number"),
         (head + "a.raw,1,35,137,5,3,,\n", r"line 2: pitch_deg = '': expected a number"),
@@ -171,5 +171,5 @@ def test_poses_are_read_and_their_faults_told(tmp_path: Path) -> None:
         (f"attitude_sigma_deg,{head}0,a.raw,1,35,137,5,1,1,1\n", r"line 2: attitude_sigma_deg = '0'"),
     ):
         path.write_text(text)
-        with pytest.raises(ConfigError, match=says):
+        with pytest.raises(ConfigError, match=message):
             read_poses(path)

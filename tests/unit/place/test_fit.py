@@ -198,7 +198,7 @@ def test_a_mean_shift_test_is_the_larger_fit(bound: float) -> None:
     assert not np.any(empty[2:])
 
 
-def test_the_nearest_point_to_sights() -> None:
+def test_the_nearest_point_to_lines_of_sight() -> None:
     rng = np.random.default_rng(6)
     enu, here = rng.uniform(-10, 10, (6, 3)) + np.array([0, 50, 0]), np.array([1.0, 2.0, 3.0])
     sights = (enu - here) / np.linalg.norm(enu - here, axis=1, keepdims=True) + rng.normal(0, 1e-3, (6, 3))
@@ -269,8 +269,8 @@ def test_a_doubt_is_the_mean_over_both_hypotheses(off: float) -> None:
     weight = rarely * math.exp(two - one) / (1 - rarely + rarely * math.exp(two - one))
     away = (there - at)[:6]
     want = max(weight - rarely, 0) * (wider - spread)[:6, :6] + weight * np.outer(away, away)
-    told = SimpleNamespace(free=np.ones(14, bool))
-    equations: Any = SimpleNamespace(problem=told, angles=angles, angles_miss=seen[30:] - angles @ at)
+    reported = SimpleNamespace(free=np.ones(14, bool))
+    equations: Any = SimpleNamespace(problem=reported, angles=angles, angles_miss=seen[30:] - angles @ at)
     out = _doubted(equations, spread)
     little = np.trace(want[:3, :3]) < 0.01 * np.trace(spread[:3, :3])
     np.testing.assert_allclose(out, 0 * want if little else want, rtol=1e-3, atol=1e-6)

@@ -170,8 +170,8 @@ def test_a_place_with_its_sigmas(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(log.covariance_m2[0])), [0.020, 0.023, 0.031])
     # An ellipse is that of the covariance.
     covariance = np.array([[4.0, -1.5, 0.0], [-1.5, 1.0, 0.0], [0.0, 0.0, 9.0]])
-    told = gst(clock_of(0.0, NOON), 1.0, covariance).strip()
-    found = read_nmea(write(tmp_path, told, at("120000.00")), NOON, 0.0)
+    reported = gst(clock_of(0.0, NOON), 1.0, covariance).strip()
+    found = read_nmea(write(tmp_path, reported, at("120000.00")), NOON, 0.0)
     np.testing.assert_allclose(found.covariance_m2, [covariance], atol=0.01)
 
 

@@ -56,8 +56,8 @@ def trials(
         views.append(seen(points, stated_px, spec))
         errors.append(views[-1].points_px - BAR_PX)
     off = np.array(errors)
-    told = ([getattr(view, name) for view in views] for name in ("sigma_px", "pixel_px", "across"))
-    return off - off.mean(1, keepdims=True), *map(np.array, told)
+    reported = ([getattr(view, name) for view in views] for name in ("sigma_px", "pixel_px", "across"))
+    return off - off.mean(1, keepdims=True), *map(np.array, reported)
 
 
 @pytest.mark.parametrize("step_px", [0.0, 0.5, 3.0])
@@ -72,22 +72,22 @@ def test_an_error_within_pixels_stays_as_long_as_the_image_does(step_px: float) 
         assert pixels == pytest.approx(0.08, abs=0.003)
 
 
-def test_a_bar_that_leans_otherwise_in_each_frame_is_less_sure() -> None:
+def test_a_bar_of_another_tilt_in_each_frame_is_less_sure() -> None:
     errors, sigmas, _, across = trials(3, 3.0, 0.05, lean=0.01, stated_px=0.05)
     mode = LEVER / np.linalg.norm(LEVER)
     lean = errors[:, :, 0] @ mode
-    said = across * np.sqrt((sigmas**2) @ mode**2)
+    reported = across * np.sqrt((sigmas**2) @ mode**2)
     # Of a variance estimated with 7 degrees of freedom: Student's t, 7 / 5, and 3 sigmas .02.
-    assert 0.9 < float(np.mean((lean / said) ** 2)) < 1.7
-    assert float(np.mean(np.abs(lean) > 3 * said)) < 0.04
+    assert 0.9 < float(np.mean((lean / reported) ** 2)) < 1.7
+    assert float(np.mean(np.abs(lean) > 3 * reported)) < 0.04
     # Along it, they scatter as they say.
-    assert float(np.mean(sigmas**2)) < 0.2 * float(np.mean(said**2))
+    assert float(np.mean(sigmas**2)) < 0.2 * float(np.mean(reported**2))
     # By what frames state alone it was beyond 3 sigmas in the mean.
     assert float(np.mean((lean / math.hypot(0.05 * LINE, 0.03)) ** 2)) > 10
 
 
 @pytest.mark.parametrize("across_px", [0.02, 0.06, 0.18])
-def test_errors_across_a_bar_are_said_by_what_it_shows(across_px: float) -> None:
+def test_errors_across_a_bar_are_stated_by_what_it_shows(across_px: float) -> None:
     """White errors of another size across than along: said within a factor of what there is, safe side."""
     errors, sigmas, _, across = trials(4, 0.0, [across_px, 0.06], stated_px=0.06, spec=EXACT)
     there, along = np.var(errors, axis=(0, 1)) * 16 / 15, sigmas.mean(1)

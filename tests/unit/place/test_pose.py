@@ -57,22 +57,22 @@ def drawn(
     exact = views([bar(p) for p in places], np.zeros(3), UP.rotation(), rng, noise_px, true, across)
     for view, gap in zip(exact, between, strict=False):
         arm = view.enu_m - view.enu_m.mean(0)
-        said = view.enu_m + rng.normal(0, survey[0], 3) + np.cross(rng.normal(0, survey[1], 3), arm)
-        said = said + rng.normal(0, math.hypot(survey[2], spec.stretch_share)) * arm
+        result = view.enu_m + rng.normal(0, survey[0], 3) + np.cross(rng.normal(0, survey[1], 3), arm)
+        result = result + rng.normal(0, math.hypot(survey[2], spec.stretch_share)) * arm
         whole = view.points_px[-1] - view.points_px[0]
         along = whole / np.linalg.norm(whole)
         longways = math.hypot(spec.shared_along_px, spec.shared_share * float(whole @ along) * 16 / 15)
         points = view.points_px + rng.normal(0, longways) * along + gap * shaken
         points = points + rng.normal(0, spec.shared_sigma_px) * np.array([-along[1], along[0]])
-        seen.append(replace(view, enu_m=said, points_px=points, survey=survey, between=gap))
-    told = None
+        seen.append(replace(view, enu_m=result, points_px=points, survey=survey, between=gap))
+    reported = None
     if known is not None:
         # A bias of each angle, an offset in time that moves all of them, and noise.
         off = np.degrees(known.standing()) @ rng.normal(size=4) + rng.normal(0, known.white_sigma_deg, 3)
         heading = None if known.heading_deg is None else known.heading_deg + off[2]
         pitch, roll = known.pitch_deg + off[0], known.roll_deg + off[1]
-        told = replace(known, pitch_deg=pitch, roll_deg=roll, heading_deg=heading)
-    return seen, told, CameraSigma(focal_mm=focal * CAMERA.focal_mm)
+        reported = replace(known, pitch_deg=pitch, roll_deg=roll, heading_deg=heading)
+    return seen, reported, CameraSigma(focal_mm=focal * CAMERA.focal_mm)
 
 
 def moved(view: BarView, *by_m: float) -> BarView:
@@ -161,8 +161,8 @@ POINTS = {"spec": POINTS_ONLY, "noise_px": 0.3}
 def test_every_error_that_is_stated_is_in_the_covariance(places, known, errors, most_m) -> None:
     rng, squares, off_m, open_ones = np.random.default_rng(11), [], [], 0
     for _ in range(120):
-        seen, told, sigma = drawn(rng, places, known, **errors)
-        found = solve_pose(seen, CAMERA, told, errors.get("spec", USUAL), sigma)
+        seen, reported, sigma = drawn(rng, places, known, **errors)
+        found = solve_pose(seen, CAMERA, reported, errors.get("spec", USUAL), sigma)
         if isinstance(found, Rejection):
             # Two bars on gravity and a survey of 5 cm leave metres along an arc.
             assert found.kind in ("uncertain", "two-solutions"), found
@@ -185,8 +185,8 @@ def test_bars_whose_frames_leave_gaps_at_other_times_err_apart(between, known) -
     """The image moves as one, and each bar's place is interpolated by its own frames."""
     rng, spec, squares = np.random.default_rng(6), replace(POINTS_ONLY, shaken_sigma_px=0.1), []
     for _ in range(200):
-        seen, told, _ = drawn(rng, POLES, known, spec=spec, noise_px=0.05, between=between)
-        squares.append(squared(solved(solve_pose(seen, CAMERA, told, spec))))
+        seen, reported, _ = drawn(rng, POLES, known, spec=spec, noise_px=0.05, between=between)
+        squares.append(squared(solved(solve_pose(seen, CAMERA, reported, spec))))
     # What bars have for their own counts as independent of what they share, though it is the same motion.
     assert 1.9 < np.mean(squares) < 3.6
 
@@ -194,9 +194,9 @@ def test_bars_whose_frames_leave_gaps_at_other_times_err_apart(between, known) -
 @pytest.mark.parametrize(("which", "way"), list(enumerate(np.eye(3))))
 @pytest.mark.parametrize("known", [COMPASS, GRAVITY])
 def test_a_bar_that_disagrees_is_left_out_by_name(which: int, way: Floats, known: Attitude) -> None:
-    seen, told, _ = drawn(np.random.default_rng(13), THREE, known)
+    seen, reported, _ = drawn(np.random.default_rng(13), THREE, known)
     seen[which] = moved(seen[which], *0.5 * way)
-    found = solve_pose(seen, CAMERA, told)
+    found = solve_pose(seen, CAMERA, reported)
     if isinstance(found, Rejection):
         # A pair that stays cannot always tell which of three is wrong; it never says a place.
         assert found.kind == "misfit", found
@@ -211,12 +211,12 @@ def test_a_bar_that_disagrees_is_left_out_by_name(which: int, way: Floats, known
 def test_where_a_left_out_bar_stands_is_the_weighted_fit_of_its_points(across: float) -> None:
     """Least squares with the points' whole covariance, along the bar and across; and of the pose."""
     rng, spec = np.random.default_rng(34), ErrorModel()
-    seen, told, sigma = drawn(rng, THREE, COMPASS, (2e-4, 0.0, 0.0), across=across)
+    seen, reported, sigma = drawn(rng, THREE, COMPASS, (2e-4, 0.0, 0.0), across=across)
     wrong = moved(seen[1], -0.3, 0.4, -0.2)
-    pose = solved(solve_pose(seen, CAMERA, told, spec))
+    pose = solved(solve_pose(seen, CAMERA, reported, spec))
     # As sure as the bar's image, so that each part of the covariance counts.
     pose = replace(pose, covariance=0.1 * pose.covariance)
-    problem = Problem.of([seen[0], wrong, seen[2]], CAMERA, told, spec, sigma)
+    problem = Problem.of([seen[0], wrong, seen[2]], CAMERA, reported, spec, sigma)
     assert isinstance(problem, Problem)
     found = estimate_fault(problem, 1, pose, 30.0, 5)
     limit = stats.chi2.isf(spec.false_alarm / 2 / 5, 6)
@@ -246,16 +246,16 @@ def test_where_a_left_out_bar_stands_is_the_weighted_fit_of_its_points(across: f
 
 
 def test_an_attitude_that_disagrees_is_left_out_by_name() -> None:
-    seen, told, _ = drawn(np.random.default_rng(14), THREE, COMPASS)
-    assert told is not None
+    seen, reported, _ = drawn(np.random.default_rng(14), THREE, COMPASS)
+    assert reported is not None
     for change, part in (({"heading_deg": 3.0}, "heading"), ({"roll_deg": 2.0}, "attitude")):
-        found = solved(solve_pose(seen, CAMERA, replace(told, **change)))
+        found = solved(solve_pose(seen, CAMERA, replace(reported, **change)))
         assert (found.excluded, found.failed) == ((part,), None)
         assert abs(math.remainder(Attitude.of_rotation(found.rotation).heading_deg or 0, 360)) < 0.3
         assert np.linalg.norm(found.enu_m) < 0.3
     # Of two bars, either may be the wrong one; so may the heading.
     seen[0] = moved(seen[0], 0.0, 0.0, 0.5)
-    both = refused(solve_pose(seen[:2], CAMERA, told))
+    both = refused(solve_pose(seen[:2], CAMERA, reported))
     assert both.kind == "misfit"
     assert {"bar 0", "bar 1"} <= set(both.suspects)
 
@@ -266,10 +266,10 @@ def test_a_focal_length_that_is_another_lens_is_found(said_mm: float) -> None:
     rng = np.random.default_rng(4)
     for places, known in ((THREE[1:], UP), (THREE, Attitude(pitch_deg=5.0))):
         seen = views([bar(p) for p in places], np.zeros(3), UP.rotation(), rng)
-        said = replace(CAMERA, focal_mm=said_mm)
-        found = solve_pose(seen, said, known)
+        reported = replace(CAMERA, focal_mm=said_mm)
+        found = solve_pose(seen, reported, known)
         assert found.kind == "misfit" if isinstance(found, Rejection) else found.excluded
-        assert fitting_focal_mm(seen, said, known) == pytest.approx(35.0, rel=0.04)
+        assert fitting_focal_mm(seen, reported, known) == pytest.approx(35.0, rel=0.04)
     # None fits a bar that is moved aside.
     assert math.isnan(fitting_focal_mm([moved(seen[0], 0.0, 0.0, 0.5), seen[1]], CAMERA, UP))
 
@@ -293,16 +293,16 @@ def test_protection_levels_cover_what_no_test_finds() -> None:
     hidden = 0
     for trial in range(60):
         three = trial % 2
-        seen, told, _ = drawn(rng, THREE if three else POLES, COMPASS)
+        seen, reported, _ = drawn(rng, THREE if three else POLES, COMPASS)
         camera, size = CAMERA, 10 ** rng.uniform(-2, 0)
         which = trial % 3
         if which == 0:
             seen[0] = moved(seen[0], *size * rng.normal(size=3))
         elif which == 1:
-            told = replace(told, pitch_deg=told.pitch_deg + size)
+            reported = replace(reported, pitch_deg=reported.pitch_deg + size)
         else:
             camera = replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + 0.01 * size))
-        found = solve_pose(seen, camera, told)
+        found = solve_pose(seen, camera, reported)
         if isinstance(found, Rejection) or math.isinf(found.hpl_m):
             continue
         assert math.hypot(*found.enu_m[:2]) < found.hpl_m
@@ -335,30 +335,30 @@ def test_levels_hold_for_faults_of_the_size_that_is_stated(fault: str, size: flo
     usual = ErrorModel(bar_fault_m=0.01, attitude_fault_deg=0.1)
     stated, spared = (replace(usual, **{fault: value}) for value in (size, 0.0))
     for trial in range(40):
-        (seen,), told, _ = drawn(rng, POLES[:1], COMPASS)
+        (seen,), reported, _ = drawn(rng, POLES[:1], COMPASS)
         camera, off = CAMERA, (-1) ** trial * 2.0 * size
         if fault == "bar_fault_m":
             seen = moved(seen, off, 0.0, 0.0)
         elif fault == "attitude_fault_deg":
-            told = replace(told, heading_deg=(told.heading_deg or 0.0) + off)
+            reported = replace(reported, heading_deg=(reported.heading_deg or 0.0) + off)
         else:
             camera = replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + off))
-        pose, other = (solved(solve_pose([seen], camera, told, spec)) for spec in (stated, usual))
+        pose, other = (solved(solve_pose([seen], camera, reported, spec)) for spec in (stated, usual))
         assert math.hypot(*pose.enu_m[:2]) < pose.hpl_m < 50
         assert abs(pose.enu_m[2]) < pose.vpl_m < 50
         outside += math.hypot(*other.enu_m[:2]) > other.hpl_m
         # A part that may be off by any amount leaves nothing protected.
-        assert math.isinf(solved(solve_pose([seen], camera, told, spared)).hpl_m)
+        assert math.isinf(solved(solve_pose([seen], camera, reported, spared)).hpl_m)
     assert outside > 20
 
 
-def test_false_alarms_are_as_rare_as_said() -> None:
+def test_false_alarms_are_as_rare_as_stated() -> None:
     """At a chance that can be counted: one of fifty."""
     rng, spec = np.random.default_rng(18), ErrorModel(false_alarm=0.02)
     alarms = 0
     for _ in range(200):
-        seen, told, sigma = drawn(rng, THREE, COMPASS, SURVEY, 0.002)
-        found = solve_pose(seen, CAMERA, told, spec, sigma)
+        seen, reported, sigma = drawn(rng, THREE, COMPASS, SURVEY, 0.002)
+        found = solve_pose(seen, CAMERA, reported, spec, sigma)
         alarms += isinstance(found, Rejection) or bool(found.excluded)
     # Tests of overlapping parts share alarms, and the total is counted by Huber: never more, and not none.
     assert 1 <= alarms <= stats.binom.isf(1e-3, 200, 0.02)
@@ -395,7 +395,7 @@ def test_what_is_not_determined_is_refused() -> None:
     assert refused(solve_pose(swapped, CAMERA, COMPASS)).kind in ("misfit", "not-determined")
 
 
-def test_both_poses_are_told_where_two_fit() -> None:
+def test_both_poses_are_reported_where_two_fit() -> None:
     """Two small bars, noisy and far: seen alike from the side, too. One of them is the truth."""
     rng = np.random.default_rng(0)
     bars = [0.1 * bar((0, 0, 0)) + [-2.6, 58.4, 3.9], 0.1 * bar((0, 0, 0)) + [0.5, 57.1, 5.8]]

@@ -174,16 +174,16 @@ def test_gravity_and_north_are_those_of_the_place_not_of_the_first_site() -> Non
 @pytest.mark.parametrize("known_from", [0, 2])
 def test_a_mirror_image_is_no_bar(known_from: int) -> None:
     """The bar's image in a wet road, upside down under it, repeats its beacon; fixes are those of the bar."""
-    told = {n: (heard(LEFT, "verified", 0),) for n in range(8)}
-    own = packets_of(LEFT, 0, 8, messages=told)
+    reported = {n: (heard(LEFT, "verified", 0),) for n in range(8)}
+    own = packets_of(LEFT, 0, 8, messages=reported)
     image = []
-    for n, packet in enumerate(packets_of(LEFT, 1, 8, messages=told)):
+    for n, packet in enumerate(packets_of(LEFT, 1, 8, messages=reported)):
         echo_of = 0 if n >= known_from else None
         frames = tuple(
             dataclasses.replace(f, echo_of=echo_of, points_px=f.points_px * [1, -1] + [0, 1100])
             for f in packet.frames
         )
-        image.append(dataclasses.replace(packet, frames=frames, messages=() if echo_of == 0 else told[0]))
+        image.append(dataclasses.replace(packet, frames=frames, messages=() if echo_of == 0 else reported[0]))
     # No site names a transmitter, so that only a bar that is alone stands there by its number.
     want, both = fixes_of(positioner([LEFT]), own), positioner([LEFT])
     fixes = fixes_of(both, merged(own, image))
@@ -205,14 +205,14 @@ def heard(bar: BarSite, trust: Trust, packet: int) -> ReceivedMessage:
 
 def test_beacons_tell_who_and_where() -> None:
     # The id decides, not the receiver's number, which is the other bar's here.
-    told = {0: (heard(RIGHT, "unverified", 0),)}
-    fixes = fixes_of(positioner([LEFT, RIGHT]), packets_of(RIGHT, 0, 6, messages=told))
+    reported = {0: (heard(RIGHT, "unverified", 0),)}
+    fixes = fixes_of(positioner([LEFT, RIGHT]), packets_of(RIGHT, 0, 6, messages=reported))
     assert_right(fixes)
     assert not any(f.verified for f in fixes)
     # Without a file, a verified beacon's own place is believed, until one is forged.
-    told = {0: (heard(RIGHT, "verified", 0),), 4: (heard(LEFT, "forged", 4),)}
+    reported = {0: (heard(RIGHT, "verified", 0),), 4: (heard(LEFT, "forged", 4),)}
     p = positioner([])
-    fixes = fixes_of(p, packets_of(RIGHT, 0, 9, messages=told))
+    fixes = fixes_of(p, packets_of(RIGHT, 0, 9, messages=reported))
     given = [f for f in fixes if not f.refusal]
     assert_right(given)
     assert all(f.verified for f in given)
@@ -257,8 +257,10 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
     """From behind two bars the image of swapped ones is the same; what they say of themselves tells."""
     gravity = Attitude(4.0, 1.0, None, 0.0, 0.0)
     swapped = [dataclasses.replace(LEFT, transmitter_id=9), dataclasses.replace(RIGHT, transmitter_id=7)]
-    told = [{0: (heard(bar, "unverified", 0),)} for bar in (LEFT, RIGHT)]
-    stream = merged(packets_of(LEFT, 0, 6, messages=told[0]), packets_of(RIGHT, 1, 6, messages=told[1]))
+    reported = [{0: (heard(bar, "unverified", 0),)} for bar in (LEFT, RIGHT)]
+    stream = merged(
+        packets_of(LEFT, 0, 6, messages=reported[0]), packets_of(RIGHT, 1, 6, messages=reported[1])
+    )
     right = positioner([LEFT, RIGHT], gravity)
     assert_right(fixes_of(right, stream))
     assert right.bars.contradicted == {}
@@ -274,7 +276,7 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "expected"),
     [
         ({"length_m": 1.92}, "0.96 m long, its site 1.92 m"),
         ({"length_m": 0.965}, None),
@@ -284,13 +286,13 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
         ({"height_m": LEFT.height_m + 0.3}, None),
     ],
 )
-def test_a_bar_that_is_not_its_site(change: dict[str, float], told: str | None) -> None:
+def test_a_bar_that_is_not_its_site(change: dict[str, float], expected: str | None) -> None:
     """A lone bar of the wrong length or place fits the image as well as the right one."""
     registry = BarRegistry([dataclasses.replace(LEFT, **change)], ErrorModel())
     registry.add_packet(Packet(0, 0, 0.0, 100.0, (), 10, messages=(heard(LEFT, "unverified", 0),)))
-    assert (registry.site(0) is None) == (told is not None)
-    assert (told or "") in registry.contradiction(0)
-    assert bool(told) == bool(registry.contradiction(0))
+    assert (registry.site(0) is None) == (expected is not None)
+    assert (expected or "") in registry.contradiction(0)
+    assert bool(expected) == bool(registry.contradiction(0))
 
 
 def test_an_attitude_file(tmp_path: Path) -> None:
@@ -309,7 +311,7 @@ def test_an_attitude_file(tmp_path: Path) -> None:
         AttitudeLog.read(path)
 
 
-def test_poses_that_are_left_open_are_told_on_earth() -> None:
+def test_poses_that_are_left_open_are_reported_on_earth() -> None:
     here, axes = LocalAxes(35.2, 137.1, 60.0), LocalAxes(35.0, 137.0, 50.0)
     spread = np.diag([1.0, 4.0, 9.0])
     open_one = Candidate(np.array([5.0, 6.0, 7.0]), Attitude(1.0, 2.0, 30.0).rotation(), spread, 0.5)

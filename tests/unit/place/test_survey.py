@@ -49,9 +49,9 @@ def views(rng, place_m, turn_deg, focal=0.0, bend_px=0.0, bars=BARS) -> list[Cal
             points = points + bend[:, None] * way / np.linalg.norm(way) + rng.normal(0, 0.1, points.shape)
             seen.append(BarView(bar.transmitter_id, np.empty((0, 3)), points, np.full(16, 0.1)))
         off = tilt + rng.normal(0, math.radians(turn_deg), 3)
-        said = Rotation.from_rotvec(off).as_matrix() @ ROTATION
+        reported = Rotation.from_rotvec(off).as_matrix() @ ROTATION
         where = place + drift + rng.normal(0, place_m, 3)
-        found.append(CalibrationView(tuple(seen), where, place_m, said, turn_deg))
+        found.append(CalibrationView(tuple(seen), where, place_m, reported, turn_deg))
     return found
 
 
@@ -76,7 +76,7 @@ def test_bars_come_back_within_their_sigmas() -> None:
     assert 0.03 < np.mean(wide) < 0.5
 
 
-def test_a_bar_that_looks_bent_leans_within_its_sigma() -> None:
+def test_a_bar_that_looks_curved_is_tilted_within_its_sigma() -> None:
     """The perspective of a lean towards the camera is a bend, and the same in all views."""
     rng = np.random.default_rng(12)
     bars = [site_at(7, [0.1, 45.0, 0.2], 6.0, 10.0)]
@@ -93,7 +93,7 @@ def test_a_bar_that_looks_bent_leans_within_its_sigma() -> None:
     assert low < np.mean(np.square(sigmas[bent])) < high < np.mean(np.square(sigmas[SPEC]))
 
 
-def test_what_cannot_be_surveyed_is_told() -> None:
+def test_what_cannot_be_surveyed_is_reported() -> None:
     seen = views(np.random.default_rng(10), 0.02, 0.05)
     with pytest.raises(ConfigError, match="needs poses with heading_deg"):
         survey([dataclasses.replace(seen[0], rotation=None)], AXES, 0.96, CAMERA)

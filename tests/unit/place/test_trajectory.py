@@ -323,9 +323,9 @@ def test_a_turning_car_is_followed_through_a_gap(push: bool) -> None:
             for at in (20, 37, 38, 55):
                 off = square(found[at].mean[:3] - truth[at], found[at].covariance_m2)
                 squares.setdefault((name, at), []).append(off)
-        told = points[-1].standing(IMU)
-        estimates.append(square(told[0] - biases, told[1]))
-        sigmas.append(np.sqrt(np.diag(told[1])))
+        reported = points[-1].standing(IMU)
+        estimates.append(square(reported[0] - biases, reported[1]))
+        sigmas.append(np.sqrt(np.diag(reported[1])))
     assert all(by_chance(values, 3, 0.9999) for values in squares.values())
     assert by_chance(estimates, 4 if push else 1, 0.9999)
     assert np.mean(sigmas, 0)[0] < 0.5
@@ -363,10 +363,10 @@ def drive(rng: np.random.Generator) -> tuple[list[Fix], dict[tuple[str, str], fl
         for b in range(8):
             centre = np.array([(-1) ** b * 4.0, 60 + 25.0 * b, 0.5 * (b % 3)])
             if 28 < centre[1] - place[1] < 90:
-                said = bar(centre)
-                points, _ = project_bars(said + off[b], place, turned, lens)
+                reported = bar(centre)
+                points, _ = project_bars(reported + off[b], place, turned, lens)
                 points += rng.normal(0, 0.07, points.shape) + rng.normal(0, BIASED.shared_sigma_px, 2)
-                views.append(BarView(b, said, points, np.full(16, 0.0707), (SITE_M, 0.0, 0.0)))
+                views.append(BarView(b, reported, points, np.full(16, 0.0707), (SITE_M, 0.0, 0.0)))
         pose = solve_pose(views, CAMERA, attitude, BIASED, LENS)
         if not isinstance(pose, Rejection):
             heading = Attitude.of_rotation(pose.rotation).heading_deg
@@ -383,11 +383,11 @@ def states_of(point: TrajectoryPoint) -> dict[str, tuple[Floats, Floats]]:
 def test_a_drive_past_bars_tells_their_errors_and_its_own() -> None:
     rng, squares, widths = np.random.default_rng(7), [], []
     sites = {b: BarSite(b, 35.0, 137.0, 50.0, position_sigma_m=SITE_M) for b in range(8)}
-    said = Attitude(0, 0, 0, BIAS_DEG, BIAS_DEG, time_sigma_us=TIME_US)
+    reported = Attitude(0, 0, 0, BIAS_DEG, BIAS_DEG, time_sigma_us=TIME_US)
     for _ in range(3):
         fixes, truth = drive(rng)
         last = filter_fixes(fixes, dataclasses.replace(BIASED, acceleration_m2_s3=0.01))[-1]
-        rows = estimate_biases(states_of(last), CAMERA, LENS, said, sites, BIASED)
+        rows = estimate_biases(states_of(last), CAMERA, LENS, reported, sites, BIASED)
         squares += [((row.correction - truth[row.part, row.what]) / row.sigma) ** 2 for row in rows]
         table = {(row.part, row.what): row for row in rows}
         for key in (("camera", "focal_mm"), ("attitude", "time_us"), ("attitude", "heading_deg")):

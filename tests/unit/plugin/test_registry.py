@@ -21,18 +21,18 @@ def ranging(name: str, target: str = "nowhere:Nothing") -> Algorithm:
 
 
 @pytest.mark.parametrize(
-    ("role", "name", "says"),
+    ("role", "name", "message"),
     [
         ("ranging", "pco", "named 'pco'; did you mean 'poc'? (installed: centroid, poc)"),
         ("ranging", "time-of-flight", "named 'time-of-flight' (installed: centroid, poc)"),
         ("pilots", "wh", "named 'wh' (installed: none)"),
     ],
 )
-def test_one_wrong_id_has_one_answer(role: str, name: str, says: str) -> None:
+def test_one_wrong_id_has_one_answer(role: str, name: str, message: str) -> None:
     registry = Registry(Brings(ranging("poc"), ranging("centroid")))
     with pytest.raises(UnknownAlgorithmError) as caught:
         registry.find(role, name)
-    assert str(caught.value) == f"no {role} algorithm {says}"
+    assert str(caught.value) == f"no {role} algorithm {message}"
 
 
 class Owner(NamedTuple):
@@ -54,7 +54,7 @@ def install(
     monkeypatch.setattr("evlcp_sdk.plugin.registry.entry_points", lambda group: points)
 
 
-def test_two_algorithms_with_one_name_are_told_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_algorithms_with_one_name_are_reported_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     both = {"evlcp-sdk": Brings(ranging("poc"), ranging("centroid")), "evlcp-fast": Brings(ranging("poc"))}
     install(monkeypatch, *((owner, owner, partial(both.get, owner)) for owner in both))
     registry = Registry.load()
@@ -108,12 +108,12 @@ BROKEN: dict[str, tuple[Callable[[], object], str]] = {
 
 
 @pytest.mark.parametrize("fault", BROKEN)
-def test_a_broken_plugin_is_left_out_and_told(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_broken_plugin_is_left_out_and_reported(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     load, reason = BROKEN[fault]
     install(monkeypatch, ("good", "evlcp-sdk", lambda: Brings(ranging("poc"))), ("bad", "evlcp-cam", load))
-    with pytest.warns(PluginWarning, match="plugin bad of evlcp-cam 1.0 is broken and left out: ") as told:
+    with pytest.warns(PluginWarning, match="plugin bad of evlcp-cam 1.0 is broken and left out: ") as warned:
         entry = (registry := Registry.load()).find("ranging", "poc")
-    assert len(told) == 1
+    assert len(warned) == 1
     assert entry.distribution == "evlcp-sdk"
     (broken,) = registry.broken
     assert (broken.plugin, broken.distribution) == ("bad", "evlcp-cam 1.0")
@@ -171,11 +171,11 @@ def odd(x: "Nothing") -> None: ...  # type: ignore[name-defined]  # noqa: F821
 )
 def test_the_command_line_goes_on_without_a_broken_plugin(stranger, reason, monkeypatch, evlcp) -> None:
     install(monkeypatch, ("stranger", "evlcp-stranger", stranger), beside=True)
-    told = f"evlcp: warning: plugin stranger of evlcp-stranger 1.0 is broken and left out: {reason}"
+    message = f"evlcp: warning: plugin stranger of evlcp-stranger 1.0 is broken and left out: {reason}"
     for command in ("--help", "plugins"):
         done = evlcp(command)
         assert done.code == 0
-        assert done.err.startswith(told)
+        assert done.err.startswith(message)
         assert done.err.count("\n") == 1
     assert "mine" not in evlcp("--help").out
     asked = evlcp("config", "--set", "ranging.id=mine")
@@ -204,15 +204,15 @@ def test_broken_and_conflicting_plugins_are_listed(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    ("target", "told"),
+    ("target", "message"),
     [
         ("nowhere:Nothing", "cannot import nowhere:Nothing: ModuleNotFoundError: No module named 'nowhere'"),
         ("", "cannot import : "),
         ("json:JSONDecoder", "json:JSONDecoder is not a Ranging"),
     ],
 )
-def test_a_target_that_cannot_be_used(target: str, told: str) -> None:
+def test_a_target_that_cannot_be_used(target: str, message: str) -> None:
     registry = Registry(Brings(ranging("x", target)))
     with pytest.raises(PluginError, match=r"^ranging algorithm 'x' of Brings-\w+: ") as caught:
         registry.load_class("ranging", "x")
-    assert told in str(caught.value)
+    assert message in str(caught.value)

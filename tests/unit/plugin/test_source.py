@@ -36,7 +36,7 @@ EVENTS = Events.of([1, 2], [3, 4], [5, 6], [1, 7])
 
 
 @pytest.mark.parametrize(
-    ("gives", "says"),
+    ("gives", "message"),
     [
         (lambda: 5, r"gave \(int\), expected \(Events, Triggers\)"),
         (lambda: (EVENTS,), r"gave \(Events\), expected .*"),
@@ -46,8 +46,8 @@ EVENTS = Events.of([1, 2], [3, 4], [5, 6], [1, 7])
         (lambda: raises(SystemExit(0)), r"SystemExit: 0 \(test_source.py, line \d+\)"),
     ],
 )
-def test_what_no_receiver_can_take_is_named(gives: Callable[[], Any], says: str) -> None:
-    with pytest.raises(PluginError, match=f"^strange:0: source Strange: {says}$"):
+def test_what_no_receiver_can_take_is_named(gives: Callable[[], Any], message: str) -> None:
+    with pytest.raises(PluginError, match=f"^strange:0: source Strange: {message}$"):
         Strange(gives).read()
 
 

@@ -53,13 +53,15 @@ def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name, lay
     try:
         measure = compiled(link)
     except ConfigError as refused:
-        said = str(refused)
-        settings = [f"ranging.{key}={value}" for key, value in re.findall(r"ranging\.(\w+) = (\d+)$", said)]
-        other = re.search(r"use '([\w-]+)' for this layout", said)
+        reported = str(refused)
+        settings = [
+            f"ranging.{key}={value}" for key, value in re.findall(r"ranging\.(\w+) = (\d+)$", reported)
+        ]
+        other = re.search(r"use '([\w-]+)' for this layout", reported)
         if settings or other:
             compiled(link_with(layout, *settings, f"ranging.id={other[1] if other else name}"))
         else:
-            assert "expected at least min_clusters" in said
+            assert "expected at least min_clusters" in reported
         return
     if np.ptp(link.bar.cluster_centres_m()[:, 0]) > 0:
         return

@@ -63,9 +63,9 @@ def view_of(
         chips, selected, offset = chips[:, ::-1], selected[:, ::-1], -offset
     if across:
         chips, selected, offset = chips.transpose(0, 2, 1), selected.transpose(0, 2, 1), offset[::-1]
-    said = symbols.copy()
-    said[list(wrong)] ^= 63
-    soft = SoftSymbols(said, np.zeros((K, 6), np.float32), 1.0)
+    reported = symbols.copy()
+    reported[list(wrong)] ^= 63
+    soft = SoftSymbols(reported, np.zeros((K, 6), np.float32), 1.0)
     return FrameView(chips.astype(np.int16), offset, map_of(selected, chips), soft)
 
 
@@ -178,9 +178,11 @@ BOUNDARIES = 74.5 + SPACING * (np.arange(1, K) - K / 2)
 
 def fit_of(codes, dim, values, spacing, offset_px=STILL):
     """The fit of a frame's values, of boundaries .45 px wide without tails, and where they lie off it."""
-    said = codes, codes[:, :0].copy(), np.zeros(K, np.int64), np.ones(K, np.bool_)
+    reported = codes, codes[:, :0].copy(), np.zeros(K, np.int64), np.ones(K, np.bool_)
     fit = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
-    (variance, *_), by_boundary = _kernels.fit_bar(said, offset_px, values, profile(1.0), (0.45, dim), 6, fit)
+    (variance, *_), by_boundary = _kernels.fit_bar(
+        reported, offset_px, values, profile(1.0), (0.45, dim), 6, fit
+    )
     assert variance > 0
     return fit, by_boundary[:, 1:-1]
 

@@ -240,7 +240,7 @@ CROSS = LedTable(((1, 0, 0, 0), (-1, 0, 0, 0), (0, 1, 0, 1), (0, -1, 0, 1)))
 
 
 @pytest.mark.parametrize(
-    ("bar", "parameters", "said"),
+    ("bar", "parameters", "message"),
     [
         *((BAR, {"clusters": some}, NOT_OF_THE_BAR) for some in ((3,), (3, 3), (2, 5, 2), (-1, 5), (2, 16))),
         (BAR, {"skip_outer": 8}, "skip_outer = 8: leaves 0 of 16"),
@@ -250,8 +250,8 @@ CROSS = LedTable(((1, 0, 0, 0), (-1, 0, 0, 0), (0, 1, 0, 1), (0, -1, 0, 1)))
         (BarLayout(LedGrid(rows=6)), {}, "needs two clusters"),
     ],
 )
-def test_other_clusters_and_too_few_are_refused(bar, parameters, said):
-    with pytest.raises(ConfigError, match=said):
+def test_other_clusters_and_too_few_are_refused(bar, parameters, message):
+    with pytest.raises(ConfigError, match=message):
         PocRanging(**{"skip_outer": 0, **parameters}).compile(CAMERA, bar, LINK.codebook)
 
 

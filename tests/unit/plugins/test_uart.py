@@ -384,7 +384,7 @@ def test_a_text_is_read_from_its_first_stretch_on_whatever_the_clock(clock):
     assert wrong_bits([one.value for one in found[-98:]], sent[-98:].tolist(), 7) < 0.01
 
 
-def test_what_a_list_has_wrong_is_said(tmp_path, evlcp):
+def test_what_a_list_has_wrong_is_reported(tmp_path, evlcp):
     """Polarities that are turned, or of one kind alone; and what the list did not say."""
     sent = np.random.default_rng(4).integers(0, 128, 60)
     events = seen(np.random.default_rng(3), levels_of(sent, 7, "even", 2), 320.0)
@@ -405,15 +405,15 @@ def test_what_a_list_has_wrong_is_said(tmp_path, evlcp):
     assert "events are ON: when the light goes off is not seen" in on["text"]
 
 
-def test_a_lamp_that_reads_as_one_character_is_said(tmp_path, evlcp):
+def test_a_lamp_that_reads_as_one_character_is_reported(tmp_path, evlcp):
     """A period of ten bits, half of it dark: 8N1 reads 0xF0 for ever. A text with blanks is none."""
 
     def warnings_of(levels):
         return received(evlcp, tmp_path, seen(np.random.default_rng(3), levels, 320.0))[1]["warnings"]
 
     lamp = warnings_of([1, *[0, 0, 0, 0, 0, 1, 1, 1, 1, 1] * 120])
-    (said,) = (one["text"] for one in lamp if one["code"] == "one-character")
-    assert "characters are 0xf0: a lamp that blinks once in a character's time" in said
+    (reported,) = (one["text"] for one in lamp if one["code"] == "one-character")
+    assert "characters are 0xf0: a lamp that blinks once in a character's time" in reported
     assert warnings_of(levels_of(np.frombuffer(b"to be or not" * 10, np.uint8), 8, "none", 1)) == []
 
 
@@ -458,9 +458,9 @@ def light_of(kind):
 @pytest.mark.parametrize("kind", ["random bits", "pair codes", "a lamp", "PWM", "a pattern", "no light"])
 def test_other_light_is_no_asynchronous_one(kind):
     events = light_of(kind)
-    found, said = infer(events.t_us, events.p)
+    found, reported = infer(events.t_us, events.p)
     assert found == {}
-    assert said.startswith("no asynchronous light found: at best ")
+    assert reported.startswith("no asynchronous light found: at best ")
 
 
 def test_a_list_is_received_without_a_link(tmp_path, evlcp):

@@ -116,9 +116,9 @@ def test_a_film_of_a_recording(evlcp: Callable[..., Any], demo_raw: Path, tmp_pa
         columns = lit[HEAD_PX:].sum(0)
         assert abs(int(columns.argmax()) - width / 2) < 0.1 * width
         if name == "b.gif":
-            told = json.loads(done.out)
-            assert (told["pictures"], told["width"], told["height"]) == (pictures, width, height)
-            assert (told["transmitters"], told["from_ms"]) == ([0], 20)
+            result = json.loads(done.out)
+            assert (result["pictures"], result["width"], result["height"]) == (pictures, width, height)
+            assert (result["transmitters"], result["from_ms"]) == ([0], 20)
         else:
             assert "1 ms from 5.6 ms on, at 1/400; 1 transmitter, 1 frame\n" in done.out
             assert f"{pictures} pictures of {width} x {height} px" in done.out
@@ -146,7 +146,7 @@ def test_what_cannot_be_filmed(demo_raw: Path, tmp_path: Path) -> None:
     write_events(few, Events.of([10, 3010], [1, 2], [3, 4], [1, 0]), 1280, 720)
     write_events(no, Events.empty(), 1280, 720)
     large: dict[str, Any] = {"for_ms": 50, "whole": True, "longest_px": 1280}
-    for told, recording, file, given in (
+    for message, recording, file, given in (
         ("100 ms at 1/400 would be 1000 pictures, at most 500", demo_raw, out, {"for_ms": 100}),
         ("500 pictures of 1280 x 740 px are 474 megapixels, at most 160", demo_raw, out, large),
         ("a film needs a file", "-", out, {}),
@@ -154,7 +154,7 @@ def test_what_cannot_be_filmed(demo_raw: Path, tmp_path: Path) -> None:
         (r"ends 3\.0 ms after its first event, nothing to show from 4 ms on", few, out, {"from_ms": 4}),
         ("no.raw: no events", no, out, {}),
     ):
-        with pytest.raises((ConfigError, InputError), match=told):
+        with pytest.raises((ConfigError, InputError), match=message):
             film(recording, file, LINK, **given)
     assert not out.exists()
     shown = film(few, out, LINK, for_ms=0.4)

@@ -72,10 +72,10 @@ def reported(folder: Path, name: str = "a.raw", **summary: Any) -> Iterator[Repo
 
 def test_numbers_are_those_of_the_files(result: Path) -> None:
     page = (result / "report.html").read_text()
-    given, told = rows_of(result / "frames.csv"), held(page)["plots"]
+    given, output = rows_of(result / "frames.csv"), held(page)["plots"]
     assert len(given) == 21
     body = re.findall(r"<tr><td>(\d+)/(\d+)</td>(.*?)</tr>", page, re.DOTALL)
-    dots = [text for _, _, text, _ in told["distance-0"]]
+    dots = [text for _, _, text, _ in output["distance-0"]]
     for row, (packet, frame, cells), dot in zip(given, body, dots, strict=True):
         values = re.findall(r"<td[^>]*>(.*?)</td>", cells)
         assert (packet, frame) == (row["packet"], row["frame"])
@@ -88,7 +88,7 @@ def test_numbers_are_those_of_the_files(result: Path) -> None:
         assert f"packet {packet}, frame {frame}," in dot
     # Dots stand where their times and distances are, to a thousandth of the chart.
     for plot, axis, column, sign in (("quality", 0, "t_us", 1), ("distance-0", 1, "distance_m", -1)):
-        at = np.array([dot[axis] for dot in told[plot]])
+        at = np.array([dot[axis] for dot in output[plot]])
         value = np.array([float(row[column]) for row in given])
         slope, first = np.polyfit(value, at, 1)
         assert slope * sign > 0
@@ -160,14 +160,14 @@ def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) ->
 def test_what_others_wrote_stays_text(tmp_path: Path) -> None:
     with reported(tmp_path, HOSTILE) as sink:
         sink._many_messages = 101
-        said: Any = SimpleNamespace(
+        output: Any = SimpleNamespace(
             t_us=1e3,
             kind=SimpleNamespace(name=HOSTILE),
             message=SimpleNamespace(transmitter_id=7),
             trust="unverified",
             summary=lambda _most: HOSTILE,
         )
-        sink._messages.append(said)
+        sink._messages.append(output)
     page = Elements((tmp_path / "report.html").read_text())
     assert not [tag for tag, _ in page.tags if tag in ("img", "iframe")]
     assert len(page.scripts) == 4
@@ -180,15 +180,15 @@ def test_the_map_shows_fixes_and_bars(tmp_path: Path) -> None:
         out.write(packets(13))
         recording = {"path": "a.raw", "duration_s": 0.5, "counts": {"events": 1}}
         summary = out.finish(RunEnd("complete", recording, {"times_real_time": 1.0}))
-    told = held((tmp_path / "report.html").read_text())["plots"]
+    output = held((tmp_path / "report.html").read_text())["plots"]
     fixes = rows_of(tmp_path / "fixes.csv")
-    assert summary["positions"]["fixes"] == len(fixes) == len(told["track"]) == len(told["map"]) - 1
-    for fix, (_, _, text, _) in zip(fixes, told["track"], strict=True):
+    assert summary["positions"]["fixes"] == len(fixes) == len(output["track"]) == len(output["map"]) - 1
+    for fix, (_, _, text, _) in zip(fixes, output["track"], strict=True):
         shown = [float(value) for value in re.findall(r"± (\S+) m", text)]
         sigmas = [float(fix[f"sigma_{axis}_m"]) for axis in ("east", "north", "up")]
         assert shown == pytest.approx(sigmas, rel=0.051)
-    assert told["map"][-1][2].startswith("bar 0\neast 0.000 m\nnorth 0.000 m")
-    assert {"height", "spread"} <= told.keys()
+    assert output["map"][-1][2].startswith("bar 0\neast 0.000 m\nnorth 0.000 m")
+    assert {"height", "spread"} <= output.keys()
 
 
 def test_nothing_found_has_a_page(tmp_path: Path) -> None:

@@ -37,8 +37,8 @@ def test_sentences_read_back(lat, lon, height, t_us, bars, speed, course) -> Non
     assert moved.spd_over_grnd == pytest.approx(speed * 3600 / 1852, abs=6e-4)
     assert abs((moved.true_course - course + 180) % 360 - 180) < 6e-3
     at = ZERO + timedelta(microseconds=t_us)
-    told = datetime.combine(moved.datestamp, moved.timestamp)
-    assert abs((told - at).total_seconds()) <= 6e-4
+    reported = datetime.combine(moved.datestamp, moved.timestamp)
+    assert abs((reported - at).total_seconds()) <= 6e-4
 
 
 def test_no_fix_says_so() -> None:
@@ -78,8 +78,8 @@ def test_reports_say_what_the_fix_says() -> None:
 
 def test_clients_are_answered() -> None:
     watch = {"enable": False, "json": False, "nmea": False}
-    said = answer('?WATCH={"enable":true,"json":true};', watch, {})
-    assert [one["class"] for one in said] == ["DEVICES", "WATCH"]
+    reported = answer('?WATCH={"enable":true,"json":true};', watch, {})
+    assert [one["class"] for one in reported] == ["DEVICES", "WATCH"]
     assert watch == {"enable": True, "json": True, "nmea": False}
     answer('?WATCH={"enable":true,"nmea":true}', watch, {})
     assert watch["nmea"]

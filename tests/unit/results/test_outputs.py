@@ -103,7 +103,7 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
     assert {second[k] for k in ("quality", "clock_ppm", "distance_median_m")} == {None}
 
 
-def test_packets_too_short_for_messages_are_said(tmp_path: Path) -> None:
+def test_packets_too_short_for_messages_are_reported(tmp_path: Path) -> None:
     table = result(tmp_path, link=load_link(overrides=["air.frames_per_packet=2"]))
     assert "expected at least 18" in table["messages_off"]
 
@@ -133,8 +133,8 @@ def test_a_reflection_is_named_as_one(tmp_path: Path) -> None:
     column = parquet.read_table(tmp_path / "frames.parquet")["echo_of"]
     assert (str(column.type), column.to_pylist()) == ("int64", [None, 0])
     assert table["result"] == "1 transmitter, 1 frame; 1 reflection, 1 frame"
-    told = [(t["transmitter"], t["echo_of"], t["frames_echo"]) for t in table["transmitters"]]
-    assert told == [(0, None, 0), (1, 0, 1)]
+    reported = [(t["transmitter"], t["echo_of"], t["frames_echo"]) for t in table["transmitters"]]
+    assert reported == [(0, None, 0), (1, 0, 1)]
     assert [(f.transmitter, f.echo_of) for f in read_frames(tmp_path)] == [(0, None), (1, 0)]
 
 
@@ -156,9 +156,9 @@ def test_the_summary_names_every_file_by_its_digest(tmp_path: Path) -> None:
     table = result(tmp_path, packet(0, frame(0, 0)), sinks=["points"])
     names = {p.name for p in tmp_path.iterdir()} - {"summary.json"}
     assert set(table["files"]) == names > {"frames.csv", "packets.jsonl"}
-    for name, told in table["files"].items():
+    for name, expected in table["files"].items():
         data = (tmp_path / name).read_bytes()
-        assert told == {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        assert expected == {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
     assert len(read_frames(tmp_path)) == 1
     changed = (tmp_path / "frames.csv").read_text().replace(",50.0000", ",51.0000")
     (tmp_path / "frames.csv").write_text(changed)
@@ -183,11 +183,11 @@ def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
     link = load_link(overrides=["tracking.id=kalman"])
     result(tmp_path, packet(0, frame(0, 0), frame(0, 1, math.nan)), link=link, sinks=["parquet"])
-    told = [
+    reported = [
         (row["distance_filtered_m"], row["distance_filtered_sigma_m"])
         for row in rows_of(tmp_path / "frames.csv")
     ]
-    assert told == [("51.0000", "0.0250"), ("", "")]
+    assert reported == [("51.0000", "0.0250"), ("", "")]
     table = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
     assert [row["distance_filtered_m"] for row in table] == [51.0, None]
 
@@ -196,11 +196,11 @@ def test_a_line_has_all_columns() -> None:
     one = frame(0, 3)
     symbols = np.where(np.arange(16) == 1, -1, one.soft.symbols)
     found = replace(one, soft=replace(one.soft, symbols=symbols), echo_of=2)
-    told = json.loads(format_frame(found, (*FRAME_COLUMNS, *FILTERED_COLUMNS)))
-    assert told.pop("line") == "frame"
-    assert list(told) == [*FRAME_COLUMNS, *FILTERED_COLUMNS]
-    assert told["symbols"][:3] == [3, None, 5]
-    for name, value in told.items():
+    output = json.loads(format_frame(found, (*FRAME_COLUMNS, *FILTERED_COLUMNS)))
+    assert output.pop("line") == "frame"
+    assert list(output) == [*FRAME_COLUMNS, *FILTERED_COLUMNS]
+    assert output["symbols"][:3] == [3, None, 5]
+    for name, value in output.items():
         given = frame_value(found, name)
         assert value == (pytest.approx(given, abs=6e-3) if isinstance(given, float) else given)
 
@@ -210,7 +210,11 @@ def test_what_is_no_number_is_null() -> None:
     for value in (math.nan, math.inf, -math.inf):
         soft = replace(found.soft, quality=value)
         odd = replace(found, soft=soft, range=Range(value, value, 0), x_px=value, link="nan inf None")
-        told = json.loads(format_frame(odd, frame_columns(filtered=False, links=True)))
+        output = json.loads(format_frame(odd, frame_columns(filtered=False, links=True)))
         names = ("quality", "distance_m", "distance_sigma_m", "x_px", "echo_of")
-        assert [told[name] for name in names] == [None] * 5
-        assert (told["line"], told["link"], told["y_px"]) == ("frame", "nan inf None", round(found.y_px, 3))
+        assert [output[name] for name in names] == [None] * 5
+        assert (output["line"], output["link"], output["y_px"]) == (
+            "frame",
+            "nan inf None",
+            round(found.y_px, 3),
+        )

@@ -126,11 +126,11 @@ def sentences(folder: Path) -> list[Any]:
 
 
 def test_files_of_a_drive(tmp_path: Path) -> None:
-    told = write(tmp_path, packets(13), PositionPlan((SITE,)), "figures", clock_zero=ZERO)
+    result = write(tmp_path, packets(13), PositionPlan((SITE,)), "figures", clock_zero=ZERO)
     fixes = rows_of(tmp_path / "fixes.csv")
-    assert told["fixes"] == len(fixes) == 12
-    assert told["bars"] == {"0": 7}
-    assert [(r["part"], r["what"]) for r in told["learnt"]] == [
+    assert result["fixes"] == len(fixes) == 12
+    assert result["bars"] == {"0": 7}
+    assert [(r["part"], r["what"]) for r in result["learnt"]] == [
         ("attitude", name) for name in ("pitch_deg", "roll_deg", "heading_deg")
     ]
     track = rows_of(tmp_path / "track.csv")
@@ -155,7 +155,7 @@ def test_files_of_a_drive(tmp_path: Path) -> None:
     assert last.spd_over_grnd * 1852 / 3600 == pytest.approx(10, abs=0.5)
     assert last.datestamp.isoformat() == "2026-03-01"
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["positions"] == json.loads(json.dumps(told))
+    assert summary["positions"] == json.loads(json.dumps(result))
     assert not list(tmp_path.glob(f"{STAGE_PREFIX}*"))
     assert (tmp_path / "track.png").read_bytes().startswith(b"\x89PNG")
 
@@ -221,14 +221,14 @@ def test_a_track_goes_on_between_bars(tmp_path: Path) -> None:
     """Bars at first and last, satellites all the time, and outside of the recording, which do not count."""
     stream = [p for p in packets(60) if not 15 <= p.packet < 45]
     plan = PositionPlan((SITE,), satellites(np.arange(-5, 40) * 1e5 + 7))
-    told = write(tmp_path, stream, plan, "figures", "mcap", clock_zero=ZERO, last_us=int(60 * PACKET_US))
-    assert (told["gnss"], told["gnss_left_out"], told["gnss_without_heading"]) == (21, 0, 0)
+    result = write(tmp_path, stream, plan, "figures", "mcap", clock_zero=ZERO, last_us=int(60 * PACKET_US))
+    assert (result["gnss"], result["gnss_left_out"], result["gnss_without_heading"]) == (21, 0, 0)
     fixes, track = rows_of(tmp_path / "fixes.csv"), rows_of(tmp_path / "track.csv")
-    assert told["gnss_outside"] == 24
+    assert result["gnss_outside"] == 24
     assert [r["t_us"] for r in fixes] == [r["t_us"] for r in track]
     assert [float(r["t_us"]) for r in track] == sorted(float(r["t_us"]) for r in track)
     sources = [r["source"] for r in track]
-    assert (sources.count("gnss"), sources.count("bars")) == (21, told["fixes"])
+    assert (sources.count("gnss"), sources.count("bars")) == (21, result["fixes"])
     check_places(track, 0.5)
     shapes = features(tmp_path)
     assert [s["properties"]["source"] for s in shapes if "source" in s["properties"]].count("gnss") == 21
@@ -237,8 +237,8 @@ def test_a_track_goes_on_between_bars(tmp_path: Path) -> None:
 
 def test_bars_and_satellites_that_contradict_one_another(tmp_path: Path) -> None:
     plan = PositionPlan((SITE,), satellites(np.arange(5, 20) * 1e5 + 7, 20.0))
-    told = write(tmp_path, packets(60), plan, clock_zero=ZERO, last_us=int(60 * PACKET_US))
-    assert told["alarms"]["contradicted"] == told["gnss_left_out"] == told["gnss"] == 15
+    result = write(tmp_path, packets(60), plan, clock_zero=ZERO, last_us=int(60 * PACKET_US))
+    assert result["alarms"]["contradicted"] == result["gnss_left_out"] == result["gnss"] == 15
     fixes = rows_of(tmp_path / "fixes.csv")
     assert {r["contradicted"] for r in fixes if r["source"] == "gnss"} == {"bars"}
     warnings = json.loads((tmp_path / "summary.json").read_text())["warnings"]
@@ -252,8 +252,8 @@ def test_bars_and_satellites_that_contradict_one_another(tmp_path: Path) -> None
     assert way.close() == ([], ())
     assert way.counts["gnss_without_heading"] == 1
     write(tmp_path / "late", packets(4), PositionPlan((SITE,), satellites([1e9, 2e9])))
-    said = json.loads((tmp_path / "late" / "summary.json").read_text())["warnings"]
-    assert "none of 2 GNSS fixes is within the recording's time" in [one["text"] for one in said]
+    output = json.loads((tmp_path / "late" / "summary.json").read_text())["warnings"]
+    assert "none of 2 GNSS fixes is within the recording's time" in [one["text"] for one in output]
 
 
 def test_the_poses_that_fit_are_a_file(tmp_path: Path) -> None:
@@ -278,8 +278,8 @@ def test_the_figure_of_a_track() -> None:
     _, close, *_ = plot_positions(settled, way.bars_enu_m(), seconds_since(0.0))
     ring = next(shape for shape in close.shapes if shape.kind == "ring")
     # Drawn larger by as much as the legend says.
-    said = ring.name
-    times = int(said.removeprefix("95 % ellipse, ").removesuffix(" times as large")) if "," in said else 1
+    label = ring.name
+    times = int(label.removeprefix("95 % ellipse, ").removesuffix(" times as large")) if "," in label else 1
     # 95 % of a normal distribution of the plane lies within 2.4477 sigma.
     fix = settled[0].fix
     values = np.linalg.eigvalsh(fix.covariance_m2[:2, :2])
@@ -319,12 +319,12 @@ def test_points_of_frames(tmp_path: Path) -> None:
 
 def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:
     stranger = dataclasses.replace(SITE, transmitter=3)
-    told = write(tmp_path / "stranger", packets(5), PositionPlan((stranger,)))
-    assert told["refused"] == {"no-site": 4}
-    assert told["sites_unseen"] == [SITE.transmitter_id]
-    told = write(tmp_path, packets(7), PositionPlan((SITE,)), attitude=Attitude(5.0, 0.0))
-    assert told["fixes"] == 0
-    assert told["refused"] == {"heading-unknown": 6}
+    result = write(tmp_path / "stranger", packets(5), PositionPlan((stranger,)))
+    assert result["refused"] == {"no-site": 4}
+    assert result["sites_unseen"] == [SITE.transmitter_id]
+    result = write(tmp_path, packets(7), PositionPlan((SITE,)), attitude=Attitude(5.0, 0.0))
+    assert result["fixes"] == 0
+    assert result["refused"] == {"heading-unknown": 6}
     found = rows_of(tmp_path / "fixes.csv")
     assert {r["refusal"] for r in found} == {"heading-unknown"}
     assert found[0]["latitude_deg"] == ""
@@ -433,10 +433,10 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
     assert bar.texts[0].text == "bar 0, id 7"
     assert len(found["/track"]) == len(fixes)
     of_fix = zip(fixes, found["/integrity"], found["/fix"], found["/pose"], strict=True)
-    for row, (_, told), (at_ns, fix), (_, pose) in of_fix:
-        assert told["misfit"] == pytest.approx(float(row["misfit"]), abs=1e-4)
-        assert list(told["alarms"]) == ["unavailable"]
-        assert told["hpl_m"] is None
+    for row, (_, expected), (at_ns, fix), (_, pose) in of_fix:
+        assert expected["misfit"] == pytest.approx(float(row["misfit"]), abs=1e-4)
+        assert list(expected["alarms"]) == ["unavailable"]
+        assert expected["hpl_m"] is None
         assert at_ns == zero_ns + round(float(row["t_us"]) * 1000)
         assert fix.timestamp.ToNanoseconds() == at_ns
         assert fix.latitude == pytest.approx(float(row["latitude_deg"]), abs=1e-10)
@@ -457,15 +457,15 @@ def test_navsat_is_read_back(tmp_path: Path) -> None:
     with (tmp_path / "navsat.mcap").open("rb") as file:
         source = reader.make_reader(file)
         assert source.get_header().profile == "ros2"
-        told = [
+        reported = [
             (schema.name, channel.topic, message.log_time, store.deserialize_cdr(message.data, schema.name))
             for schema, channel, message in source.iter_messages()
         ]
     fixes = rows_of(tmp_path / "fixes.csv")
     places = [one for one in sentences(tmp_path) if one.sentence_type == "GGA"]
-    assert {(name, topic) for name, topic, _, _ in told} == {("sensor_msgs/msg/NavSatFix", "/evlcp/fix")}
-    assert len(told) == len(fixes) > 2
-    for row, place, (_, _, at_ns, message) in zip(fixes, places, told, strict=True):
+    assert {(name, topic) for name, topic, _, _ in reported} == {("sensor_msgs/msg/NavSatFix", "/evlcp/fix")}
+    assert len(reported) == len(fixes) > 2
+    for row, place, (_, _, at_ns, message) in zip(fixes, places, reported, strict=True):
         assert at_ns == int(ZERO.timestamp()) * 10**9 + round(float(row["t_us"]) * 1000)
         assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == at_ns
         assert message.status.status == 0
@@ -484,11 +484,11 @@ def test_times_by_pulses(tmp_path: Path) -> None:
     write(tmp_path, packets(6), PositionPlan((SITE,)), "kml", "mcap", "navsat", clock_zero=pulses)
     fixes = rows_of(tmp_path / "fixes.csv")
     moved = [one for one in sentences(tmp_path) if one.sentence_type == "RMC"]
-    told = [datetime.combine(one.datestamp, one.timestamp) for one in moved]
-    assert len(told) == len(fixes) > 2
+    reported = [datetime.combine(one.datestamp, one.timestamp) for one in moved]
+    assert len(reported) == len(fixes) > 2
     called_us = [float(row["t_us"]) for row in fixes]
     assert min(called_us) < t_us[0] < max(called_us) < t_us[1]
-    for at_us, at in zip(called_us, told, strict=True):
+    for at_us, at in zip(called_us, reported, strict=True):
         # The pulse began a second of UTC; before it, what is known beforehand holds.
         after_s = (at_us - t_us[0] * (at_us >= t_us[0])) * 1e-6
         assert (at.replace(tzinfo=UTC) - ZERO).total_seconds() == pytest.approx(after_s, abs=1.1e-3)

@@ -63,7 +63,7 @@ def bring(name: str, target: str, **more: Any) -> Registry:
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [
         ("Failing", r"sink 'it' of .*: KeyError: 'boom' \(test_sinks.py, line \d+\)"),
         ("Unsayable", r"sink 'it' of .*: TypeError: Object of type object is not"),
@@ -74,10 +74,10 @@ def bring(name: str, target: str, **more: Any) -> Registry:
         ("no_such_module:Sink", r"sink 'it' of .*: cannot import no_such_module:Sink"),
     ],
 )
-def test_what_fails_is_named_and_leaves_nothing(name: str, told: str, tmp_path: Path) -> None:
+def test_what_fails_is_named_and_leaves_nothing(name: str, message: str, tmp_path: Path) -> None:
     registry = bring("it", name if ":" in name else f"{__name__}:{name}")
 
-    with pytest.raises(PluginError, match=told) as caught:
+    with pytest.raises(PluginError, match=message) as caught:
         result(tmp_path / "out", *packets(1), link=load_link(), registry=registry, sinks=["it"])
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
@@ -85,8 +85,8 @@ def test_what_fails_is_named_and_leaves_nothing(name: str, told: str, tmp_path: 
 
 def test_a_sink_that_fails_at_a_stage_is_named(demo_raw: Path, tmp_path: Path) -> None:
     registry = bring("it", f"{__name__}:Watching")
-    told = r"evlcp_stage_finished\(\) of a plugin: KeyError: '.*' \(test_sinks.py, line \d+\)"
-    with pytest.raises(PluginError, match=told):
+    message = r"evlcp_stage_finished\(\) of a plugin: KeyError: '.*' \(test_sinks.py, line \d+\)"
+    with pytest.raises(PluginError, match=message):
         receive_to_folder(demo_raw, tmp_path, registry=registry, sinks=["it"])
     assert not list(tmp_path.iterdir())
 
@@ -94,12 +94,12 @@ def test_a_sink_that_fails_at_a_stage_is_named(demo_raw: Path, tmp_path: Path) -
 def test_a_format_that_is_not_there(demo_raw: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no sink named 'parquett'; did you mean 'parquet'"):
         receive_to_folder(demo_raw, tmp_path / "out", sinks=["parquett"])
-    for more, says in (
+    for more, message in (
         ({}, r"sink 'far' of .* needs no_such_package, or leave --sink far out"),
         ({"extra": "evlcp-sdk[far]"}, r"needs the extra: pip install 'evlcp-sdk\[far\]'"),
     ):
         missing = bring("far", f"{__name__}:Failing", packages=("no_such_package",), **more)
-        with pytest.raises(ConfigError, match=says):
+        with pytest.raises(ConfigError, match=message):
             receive_to_folder(demo_raw, tmp_path / "out", registry=missing, sinks=["far"])
     assert not (tmp_path / "out").exists()
 

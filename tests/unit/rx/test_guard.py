@@ -79,7 +79,7 @@ def changed(role, change):
 
 
 @pytest.mark.parametrize(
-    ("role", "fault", "says"),
+    ("role", "fault", "message"),
     [
         *((role, KeyError("boom"), "KeyError: 'boom'") for role in ROLES),
         ("ranging", SystemExit(0), "SystemExit: 0"),
@@ -87,12 +87,12 @@ def changed(role, change):
         ("ranging", InputError("liar.raw: damaged"), "InputError: liar.raw: damaged"),
     ],
 )
-def test_what_fails_in_a_frame_is_named(role, fault, says):
-    with pytest.raises(PluginError) as told:
+def test_what_fails_in_a_frame_is_named(role, fault, message):
+    with pytest.raises(PluginError) as caught:
         received(changed(role, raises(fault)))
-    assert str(told.value).startswith(f"{role} algorithm 'mine': {says} (test_guard.py, line ")
-    assert str(told.value).endswith(f"; try: evlcp check {role} mine")
-    assert told.value.__cause__ is fault
+    assert str(caught.value).startswith(f"{role} algorithm 'mine': {message} (test_guard.py, line ")
+    assert str(caught.value).endswith(f"; try: evlcp check {role} mine")
+    assert caught.value.__cause__ is fault
 
 
 def test_an_interrupt_in_an_algorithm_is_the_user_s():
@@ -112,15 +112,15 @@ FUNCTION, METHODS = "a function", r"an object with init\(\) and step\(\)"
 
 
 @pytest.mark.parametrize(
-    ("role", "gives", "says"),
+    ("role", "gives", "message"),
     [
         ("synchronization", SimpleNamespace(init=None, step=fails), f"SimpleNamespace at .*{METHODS}"),
         ("decoding", 3, rf"int at compile\(\), expected {FUNCTION}"),
         ("tracking", Tracker(None, 5), r"int at compile\(\), .* init\(\) and step\(\) and predict\(\)"),
     ],
 )
-def test_what_compiles_to_nothing_that_runs_is_named(role, gives, says):
-    with pytest.raises(PluginError, match=f"^{role} algorithm 'mine': gave {says}; try: evlcp check"):
+def test_what_compiles_to_nothing_that_runs_is_named(role, gives, message):
+    with pytest.raises(PluginError, match=f"^{role} algorithm 'mine': gave {message}; try: evlcp check"):
         Receiver(link_with(role, lambda *_: gives))
 
 
@@ -184,12 +184,12 @@ ODD = [
 ]
 
 
-@pytest.mark.parametrize(("role", "change", "says"), ODD)
-def test_what_no_next_stage_can_work_with_is_named(role, change, says):
-    named = rf"^{role} algorithm 'mine': gave {says}.*; try: evlcp check"
-    with pytest.raises(PluginError, match=named) as told:
+@pytest.mark.parametrize(("role", "change", "message"), ODD)
+def test_what_no_next_stage_can_work_with_is_named(role, change, message):
+    named = rf"^{role} algorithm 'mine': gave {message}.*; try: evlcp check"
+    with pytest.raises(PluginError, match=named) as caught:
         received(changed(role, change))
-    assert len(str(told.value).splitlines()) == 1
+    assert len(str(caught.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize(
@@ -205,20 +205,23 @@ def test_other_types_of_right_values_pass(role, change):
 
 
 @pytest.mark.parametrize(
-    ("gives", "says"),
+    ("gives", "message"),
     [
         (None, "TypeError: gave NoneType, expected Corrected"),
         (Corrected(np.zeros(3, np.uint8), True, 0), r"ValueError: gave bits of shape \(3,\), expected"),
     ],
 )
-def test_an_error_correction_that_gives_another_thing_is_named(gives, says):
+def test_an_error_correction_that_gives_another_thing_is_named(gives, message):
     built_in = LINK.algorithm("error-correction")
 
     def compile_code(length):
         return Changed(built_in.compile(length), "decode", lambda _: gives)
 
-    for compiled, told in ((compile_code, says), (lambda _: None, "TypeError: gave NoneType at compile")):
-        with pytest.raises(PluginError, match=f"^error-correction algorithm 'mine': {told}"):
+    for compiled, expected in (
+        (compile_code, message),
+        (lambda _: None, "TypeError: gave NoneType at compile"),
+    ):
+        with pytest.raises(PluginError, match=f"^error-correction algorithm 'mine': {expected}"):
             received(link_with("error-correction", compiled))
 
 

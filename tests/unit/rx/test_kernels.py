@@ -112,8 +112,8 @@ def test_the_middle_across_a_line_of_light_and_its_profile(turn):
     edges, found = np.array([1, -1, 0, 1]), np.zeros(WIDTH)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     light = 2000 * np.exp(-((((columns - 11.3 + 1j * (rows - 7.8)) * np.conj(turn)).imag / 1.5) ** 2) / 2)
-    heard = np.concatenate([np.full((1, HEIGHT, WIDTH), 99), edges[:, None, None] * light]).astype(np.int16)
-    off = _kernels.find_offset_across(heard, edges, 11.0, 7.5, complex(turn), 5.0, 6.0, found)
+    sums = np.concatenate([np.full((1, HEIGHT, WIDTH), 99), edges[:, None, None] * light]).astype(np.int16)
+    off = _kernels.find_offset_across(sums, edges, 11.0, 7.5, complex(turn), 5.0, 6.0, found)
     assert off == pytest.approx((complex(0.3, 0.3) * np.conj(turn)).imag, abs=0.02)
     near = abs(((columns - 11.0 + 1j * (rows - 7.5)) * np.conj(turn)).real) <= 5
     # Steps up and steps down say it once each.

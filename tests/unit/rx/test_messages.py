@@ -189,7 +189,7 @@ def test_a_reflection_says_nothing_new():
     assert assembler.add(packet).messages
 
 
-def test_another_codebook_is_told():
+def test_another_codebook_is_reported():
     feed = Feed()
     assert not feed(blocks_of(Message(Kind.TEXT, 1, 0, b"Hi"), digest=b"\0\0\0\0"))
     assert feed.counts == {"blocks_tried": 1, "blocks_decoded": 1, "blocks_other_codebook": 1}
@@ -282,8 +282,8 @@ def test_every_forgery_is_found_out():
                 shown = operator().beacon(int(rng.integers(0, 1000)), elsewhere)
             case _:  # a moved one, signed by another key
                 shown = other.beacon(sequence + 1, replace(PLACE, height_m=0.0))
-        told = trusts(feed(blocks_of(*shown), transmitter=1 + trial))
-        flagged += told[-1:] == ["forged"] and "verified" not in told
+        reported = trusts(feed(blocks_of(*shown), transmitter=1 + trial))
+        flagged += reported[-1:] == ["forged"] and "verified" not in reported
     # Some tampered bytes are a place that cannot be: counted, and never handed on.
     assert flagged + feed.counts["messages_undecodable"] == 400
     assert flagged > 360

@@ -40,10 +40,10 @@ def points_of(presence, centres_m=CENTRES, at_px=(0.0, 0.0), pixels=None, **plac
     """Points, sigmas, their time and the centre, by pilots of which each has an edge of its own."""
     layout = layout_of(centres_m)
     light = np.rint(100 * presence.pixels).astype(np.int16)
-    heard = np.concatenate([np.zeros_like(light[:1]), light])
+    sums = np.concatenate([np.zeros_like(light[:1]), light])
     placement = replace(placements(presence, layout)[0], **placed)
     seen = presence if pixels is None else replace_fields(presence, pixels=pixels)
-    return points_finder(layout, np.eye(len(light), dtype=np.int64), 1)(seen, placement, heard, at_px)
+    return points_finder(layout, np.eye(len(light), dtype=np.int64), 1)(seen, placement, sums, at_px)
 
 
 def truth_of(turn, shift, layout):

@@ -81,7 +81,7 @@ def foreshortened(along=0.0, about_deg=0.0, sigma_deg=0.7, share=0.1):
 
 @pytest.mark.parametrize("lean_deg", [None, -4.0, 0.0, 12.0])
 @pytest.mark.parametrize("along", [0.0, 0.05, -0.05])
-def test_a_first_distance_stays_but_for_the_lean_that_is_known_or_likely(along, lean_deg):
+def test_a_first_distance_stays_but_for_the_tilt_that_is_known_or_likely(along, lean_deg):
     """A bar 360 px off the middle looks shorter or longer by a twentieth of its lean."""
     sight, likely = LineOfSight(along), ()
     if lean_deg is not None:
@@ -113,7 +113,7 @@ def test_sigmas_become_true(truth):
 @pytest.mark.parametrize(
     ("lean_deg", "told_deg"), [(-5.0, None), (-3.0, None), (0.0, None), (4.0, None), (6.0, 4.0)]
 )
-def test_a_lean_is_found_in_the_bend(lean_deg, told_deg):
+def test_a_tilt_is_found_in_the_curvature(lean_deg, told_deg):
     """Also by how much it differs from what an attitude tells, to 2 degrees."""
     sight = AHEAD
     if told_deg is not None:
@@ -126,7 +126,7 @@ def test_a_lean_is_found_in_the_bend(lean_deg, told_deg):
     assert abs(errors[:, -1, 0].mean()) < 0.02
 
 
-def test_a_distance_keeps_nothing_of_old_bends_and_distances():
+def test_a_distance_keeps_nothing_of_old_curvatures_and_distances():
     rng = np.random.default_rng(5)
     measured = [Range(45.1, 0.01, 15, 8.0, bend_of(4.0, 45.0, 0.04, rng)) for _ in range(400)]
     state, _ = kept(measured)
@@ -165,7 +165,7 @@ def waves(spacings_px, height_px, rng):
     return found.distance_m - true_m, found.sigma_m, frames[-1].distance_m - true_m, frames[-1].sigma_m
 
 
-def test_a_wave_of_the_pixels_is_learnt_and_taken_out():
+def test_a_pixel_phase_bias_is_estimated_and_taken_out():
     """At a spacing of 8 px and a fifteenth a wave looks like a lean, and the same in every frame."""
     # Farther away boundaries lie in many ways on the pixels; then the car stands.
     spacings_px = np.minimum(7.6 + 0.02 * np.arange(60), 8 + 1 / 15)
@@ -176,7 +176,7 @@ def test_a_wave_of_the_pixels_is_learnt_and_taken_out():
     assert np.mean((error / sigma) ** 2) < 1.5
 
 
-def test_what_is_not_known_of_the_wave_is_in_the_sigma():
+def test_what_is_not_known_of_the_pixel_phase_bias_is_in_the_sigma():
     """A camera that stands: all frames err alike, and their scatter says nothing of it."""
     rng, still_px = np.random.default_rng(10), np.full(60, 8 + 1 / 15)
     found = [waves(still_px, height_px, rng) for height_px in rng.normal(0, 0.07, 40)]
@@ -271,7 +271,7 @@ def judged(errors_of, rng):
     return np.array([(px, px - one.slope, (px - one.slope) ** 2 / one.variance) for px, one in found]).T
 
 
-def test_dark_leds_are_told_from_a_straight_bar():
+def test_dark_leds_are_distinguished_from_a_straight_bar():
     """Most boundaries agree: the error is a third of that of a scale through all, and its sigma is true."""
     rng = np.random.default_rng(2)
     before, after, squares = judged(dark, rng)

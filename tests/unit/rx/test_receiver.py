@@ -286,7 +286,7 @@ def test_what_is_dropped_is_counted():
 
 
 @pytest.mark.parametrize("back_us", [100_000, 3_000_000, 10**15])
-def test_a_camera_that_restarts_its_clock_is_heard_again(back_us):
+def test_a_camera_that_restarts_its_clock_is_received_again(back_us):
     bar, late_us = IdealBar(random_symbols(LINK, 2)), 10**12
     parts = [ideal_events(LINK, bar, t0_us=t0_us) for t0_us in (late_us, late_us - back_us)]
     receiver, packets = received(LINK, Events.concat(parts), [len(parts[0])])

@@ -144,8 +144,8 @@ def test_a_lamp_near_whole_chips_is_known_by_its_steady_time(hz, jitter_us):
     at, column, row = np.meshgrid(np.arange(100, 40_000, 1e6 / hz), np.arange(300, 320), np.arange(200, 220))
     t = (at + np.random.default_rng(hz).normal(0, jitter_us, at.shape)).astype(np.int64)
     events = in_order(*map(np.ravel, (t, column, row, t > 0)))
-    for start, heard, part in in_rhythm(events, 40_000):
-        assert start < 20_000 or len(heard) < 0.15 * len(part)
+    for start, expected, part in in_rhythm(events, 40_000):
+        assert start < 20_000 or len(expected) < 0.15 * len(part)
 
 
 @pytest.mark.parametrize("jitter_us", [3, 10])
@@ -157,8 +157,8 @@ def test_a_code_is_hardly_taken_for_a_lamp(jitter_us):
     chip, cluster = np.nonzero(np.diff(chips.astype(int), axis=0, prepend=0) == 1)
     t = (1000 + chip * packet.chip_us + rng.normal(0, jitter_us, len(chip))).astype(np.int64)
     rises = in_order(t, cluster, np.full(len(t), 3), np.ones(len(t)))
-    heard = np.concatenate([some.x for _, some, _ in in_rhythm(rises, int(t.max()))])
-    lost = 1 - np.bincount(heard, minlength=codebook.clusters) / np.bincount(cluster)
+    columns = np.concatenate([some.x for _, some, _ in in_rhythm(rises, int(t.max()))])
+    lost = 1 - np.bincount(columns, minlength=codebook.clusters) / np.bincount(cluster)
     assert lost.mean() < 0.02
     assert lost.max() < 0.15
 

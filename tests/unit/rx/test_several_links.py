@@ -55,7 +55,7 @@ def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(links):
     assert receiver.link_counts[links[0].name]["frames"] == 10 * len(one.symbols)
 
 
-def test_what_is_heard_alone_is_the_same_with_another_link_beside():
+def test_what_is_received_alone_is_the_same_with_another_link_beside():
     events = merged(at(BAR, LEFT)[1], at(BAR, RIGHT)[1], noise_events(20_000, 120_000))
     alone, single = received(BAR, events)
     _, both = received([BAR, SLOW], events)
@@ -78,7 +78,7 @@ def test_a_place_that_is_left_is_free_for_another_link():
 
 
 @pytest.mark.parametrize(
-    ("links", "said"),
+    ("links", "message"),
     [
         ([], "no link: expected one or more"),
         ([BAR, replace(WH8, name="bar")], "two links are named 'bar'"),
@@ -87,8 +87,8 @@ def test_a_place_that_is_left_is_free_for_another_link():
         ([BAR, named("fine", regions={"step_us": 1000}, modulation={"id": "wh8"})], "step_us = 1500"),
     ],
 )
-def test_links_that_cannot_be_received_together_are_refused(links, said):
-    with pytest.raises(ConfigError, match=said):
+def test_links_that_cannot_be_received_together_are_refused(links, message):
+    with pytest.raises(ConfigError, match=message):
         Receiver(links)
 
 

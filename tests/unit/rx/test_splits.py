@@ -96,17 +96,17 @@ def test_any_split_gives_the_same(scene):
     random = [np.random.default_rng(many).integers(0, len(events), many) for many in (3, 40)]
     slices = events.t_us.searchsorted(np.arange(1000, int(events.t_us[-1]), 1000))
     for cuts in ([], *random, slices):
-        told = []
-        receiver, packets = received(link, events, cuts, on_frame=told.append, **options)
+        reports = []
+        receiver, packets = received(link, events, cuts, on_frame=reports.append, **options)
         whole = [(p.t_us, p.chip_us, p.link, p.echo_of, [said(f) for f in p.frames]) for p in packets]
-        found.append(([said(frame) for frame in told], whole, receiver.counts))
+        found.append(([said(frame) for frame in reports], whole, receiver.counts))
     assert found[1:] == found[:1] * 3
     counts = receiver.counts
     assert {name: counts[name] for name in least if counts[name] < least[name]} == {}
-    assert {said(f)[:-1] for f in frames_of(packets)} <= {said(f)[:-1] for f in told}
-    assert len(told) == counts["frames"] + counts["frames_at_end"] >= 9
-    for number in {f.transmitter for f in told}:
-        order = [(f.packet, f.frame) for f in told if f.transmitter == number]
+    assert {said(f)[:-1] for f in frames_of(packets)} <= {said(f)[:-1] for f in reports}
+    assert len(reports) == counts["frames"] + counts["frames_at_end"] >= 9
+    for number in {f.transmitter for f in reports}:
+        order = [(f.packet, f.frame) for f in reports if f.transmitter == number]
         assert order == sorted(set(order))
 
 
@@ -127,7 +127,7 @@ def told_by_slices(links, events, slice_us):
     return frames
 
 
-def test_a_frame_is_told_with_the_slice_that_ends_it():
+def test_a_frame_is_given_with_the_slice_that_ends_it():
     frames = told_by_slices(LINK, BOTH, 250)
     # Those before the first lock have been there for long. Events are 20 to 30 us late; it waits half a chip.
     after = lateness([one for one in frames if one[0].packet > 0], BOTH)

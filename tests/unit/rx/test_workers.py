@@ -40,10 +40,10 @@ def test_the_same_whoever_decodes(monkeypatch):
     for link in (LINK, links):
         outcomes = []
         for many in (1, 3):
-            told = []
-            receiver, packets = received(link, EVENTS, (40_000,), on_frame=told.append, workers=many)
+            reports = []
+            receiver, packets = received(link, EVENTS, (40_000,), on_frame=reports.append, workers=many)
             frames = [(p.t_us, p.link, p.echo_of, [said(f) for f in p.frames]) for p in packets]
-            outcomes.append((frames, receiver.counts, sorted(said(f)[1:] for f in told)))
+            outcomes.append((frames, receiver.counts, sorted(said(f)[1:] for f in reports)))
         assert outcomes[0] == outcomes[1]
         assert len(frames_of(packets)) >= 50
     assert not any(child.name in ("worker 1", "worker 2") for child in multiprocessing.active_children())
@@ -51,10 +51,10 @@ def test_the_same_whoever_decodes(monkeypatch):
 
 @pytest.mark.parametrize("begun", [40_000, 1_500_000])
 @pytest.mark.parametrize(
-    ("sent", "says"),
+    ("sent", "message"),
     [(signal.SIGKILL, "ended by SIGKILL"), (signal.SIGSTOP, "did not answer for 0.5 s, and was ended")],
 )
-def test_a_worker_that_ends_or_stalls_is_named(monkeypatch, sent, says, begun):
+def test_a_worker_that_ends_or_stalls_is_named(monkeypatch, sent, message, begun):
     """Before it has a bar, and among frames."""
     monkeypatch.setattr(workers, "_STALL_S", 0.5)
     receiver = Receiver(LINK, workers=2)
@@ -62,7 +62,7 @@ def test_a_worker_that_ends_or_stalls_is_named(monkeypatch, sent, says, begun):
     receiver.feed(EVENTS[:begun])
     assert child.pid is not None
     os.kill(child.pid, sent)
-    with pytest.raises(WorkerError, match=f"^worker 1 of the receiver, process {child.pid}, {says}"):
+    with pytest.raises(WorkerError, match=f"^worker 1 of the receiver, process {child.pid}, {message}"):
         receiver.feed(EVENTS[begun:])
     child.join(10)
     assert child.exitcode == -signal.SIGKILL

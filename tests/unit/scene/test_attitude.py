@@ -86,7 +86,7 @@ FORCES = "force_right_m_s2,force_down_m_s2,force_forward_m_s2"
 
 
 @pytest.mark.parametrize(
-    ("columns", "values", "says"),
+    ("columns", "values", "message"),
     [
         ("", "95,0", "line 3: pitch_deg = '95': expected -90 to 90"),
         (",rate_right_deg_s", "0,0,0", "line 1: no column rate_down_deg_s"),
@@ -99,12 +99,14 @@ FORCES = "force_right_m_s2,force_down_m_s2,force_forward_m_s2"
         (f",{RATES},{FORCES}", "0,180,0,0,0,0,9.8,0", None),
     ],
 )
-def test_lines_that_cannot_be_are_told(tmp_path: Path, columns: str, values: str, says: str | None) -> None:
+def test_lines_that_cannot_be_are_reported(
+    tmp_path: Path, columns: str, values: str, message: str | None
+) -> None:
     path = tmp_path / "imu.csv"
     first = values.replace("95", "0").replace("1e17", "0")
     path.write_text(f"{ANGLES}{columns}\n0,{first}\n1000,{values}\n")
-    said = refusal(lambda: AttitudeLog.read(path))
-    assert said is None if says is None else says in str(said)
+    reported = refusal(lambda: AttitudeLog.read(path))
+    assert reported is None if message is None else message in str(reported)
 
 
 def test_angles_are_not_drawn_across_lines_that_are_lost() -> None:
@@ -149,10 +151,10 @@ CURVES = 10 * np.sin(2 * TURN_S) + 0.5 * NOISE, 20 * np.cos(2 * TURN_S)
         (CURVES[0], CURVES[1] * 1e3, 1e3),
     ],
 )
-def test_rates_of_another_measure_or_sign_are_told(tmp_path, heading_deg, rate_deg_s, times) -> None:
+def test_rates_of_another_measure_or_sign_are_reported(tmp_path, heading_deg, rate_deg_s, times) -> None:
     columns = zip(TURN_S * 1e6, heading_deg % 360, rate_deg_s, strict=True)
     lines = [f"{ANGLES},heading_deg,{RATES}", *(f"{t:.0f},0,0,{h:.6f},0,{r:.6f},0" for t, h, r in columns)]
     (tmp_path / "imu.csv").write_text("\n".join(lines))
-    said = refusal(lambda: AttitudeLog.read(tmp_path / "imu.csv"))
-    told = re.search(r"rates turn the camera (\S+) times as far as its headings do", said or "")
-    assert (told and float(told[1])) == (times and pytest.approx(times, rel=0.1))
+    result = refusal(lambda: AttitudeLog.read(tmp_path / "imu.csv"))
+    reported = re.search(r"rates turn the camera (\S+) times as far as its headings do", result or "")
+    assert (reported and float(reported[1])) == (times and pytest.approx(times, rel=0.1))

@@ -120,7 +120,7 @@ def test_a_csv_file_is_read_into_the_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("x_m,y_m\n0,0\n", "line 1: no column cluster (columns: x_m, y_m, cluster, z_m)"),
         ("x_m,y_m,cluster\n0,101,0\n", "line 2: y_m = '101': expected -100 to 100"),
@@ -128,19 +128,19 @@ def test_a_csv_file_is_read_into_the_table(tmp_path: Path) -> None:
         ("x_m,y_m,cluster\n0,0,-1\n", "line 2: cluster = '-1': expected 0 to 65535"),
     ],
 )
-def test_a_fault_of_a_csv_file_is_one_line(text: str, said: str, tmp_path: Path) -> None:
+def test_a_fault_of_a_csv_file_is_one_line(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "leds.csv").write_text(text)
     (tmp_path / "link.toml").write_text('[bar]\nleds_file = "leds.csv"\n')
     with pytest.raises(ConfigError) as fault:
         load_link(tmp_path / "link.toml")
-    assert str(fault.value) == f"{tmp_path / 'link.toml'}: bar.leds_file: {tmp_path / 'leds.csv'}: {said}"
+    assert str(fault.value) == f"{tmp_path / 'link.toml'}: bar.leds_file: {tmp_path / 'leds.csv'}: {message}"
 
 
 LEDS_BEHIND = [[0, 0, 0, 0], [0.1, 0, 0, 1], [0, 0, 0.3, 2]]
 
 
 @pytest.mark.parametrize(
-    ("bar", "said"),
+    ("bar", "message"),
     [
         ({"leds_file": 3}, "link.toml: bar.leds_file = 3: expected the name of a CSV file"),
         ({"leds_file": "a.csv", "leds": []}, 'link.toml: bar.leds_file = "a.csv": expected it'),
@@ -153,11 +153,11 @@ LEDS_BEHIND = [[0, 0, 0, 0], [0.1, 0, 0, 1], [0, 0, 0.3, 2]]
         ({"shape": "table", "leds": [[0, 0, 0, 0], [1e-8, 0, 0, 1]]}, "bar.leds.1: stands where bar.leds.0"),
     ],
 )
-def test_a_fault_of_a_layout_is_one_line(bar: dict[str, Any], said: str) -> None:
+def test_a_fault_of_a_layout_is_one_line(bar: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as fault:
         resolve({"bar": bar}, source="link.toml")
     (line,) = str(fault.value).splitlines()
-    assert said in line
+    assert message in line
 
 
 def test_too_many_leds_are_refused() -> None:

@@ -106,7 +106,7 @@ def test_sigmas_and_correlations_make_the_covariance() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rows", "says"),
+    ("rows", "message"),
     [
         (np.ones((1, 1)), "expected 7 rows of 7"),
         (np.ones((6, 7)), "expected 7 rows of 7"),
@@ -115,8 +115,8 @@ def test_sigmas_and_correlations_make_the_covariance() -> None:
         (1.9 * np.eye(7) - 0.9, "no direction of"),
     ],
 )
-def test_correlations_that_are_none_are_refused(rows: NDArray[np.float64], says: str) -> None:
-    with pytest.raises(ConfigError, match=f"camera_sigma.correlation: .*{says}"):
+def test_correlations_that_are_none_are_refused(rows: NDArray[np.float64], message: str) -> None:
+    with pytest.raises(ConfigError, match=f"camera_sigma.correlation: .*{message}"):
         CameraSigma(focal_mm=1.0, correlation=tuple(map(tuple, rows.tolist())))
 
 
@@ -182,7 +182,7 @@ def test_the_sigma_is_that_of_gravity_and_of_plumb_bars() -> None:
 @pytest.mark.parametrize("corner", list(product((-600.0, 600.0), (-320.0, 320.0))))
 @pytest.mark.parametrize("lens", [{"k1": -0.25}, {"k1": 0.3, "k2": -5.0}, {"p1": 0.01, "p2": -0.02}])
 @pytest.mark.parametrize("depth_m", [20.0, 45.0])
-def test_distances_and_bends_of_a_distorted_bar_are_those_of_a_pinhole(corner, lens, depth_m) -> None:
+def test_distances_and_curvatures_of_a_distorted_bar_are_those_of_a_pinhole(corner, lens, depth_m) -> None:
     """An even scale fitted to where boundaries are seen, as rangings do, by NumPy."""
     camera = CameraModel(**lens)
     middle = np.array([*corner, CAMERA.focal_px]) / CAMERA.focal_px * depth_m
@@ -204,7 +204,7 @@ def test_distances_and_bends_of_a_distorted_bar_are_those_of_a_pinhole(corner, l
     assert magnification_of(camera, clusters) == pytest.approx(sight.magnification, rel=1e-4)
 
 
-def test_a_part_of_a_bar_has_a_sight_and_a_point_has_none() -> None:
+def test_a_part_of_a_bar_has_a_line_of_sight_and_a_point_has_none() -> None:
     attitude = Attitude(4.0, 0.0)
     points, _, direction = seen(attitude, 1.0, 3.0, PLUMB)
     points[[0, 1, 2, 9]] = np.nan

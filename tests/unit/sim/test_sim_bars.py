@@ -127,14 +127,16 @@ def test_a_bar_in_the_world_sends_its_beacon() -> None:
     beacon, text = blocks_of(light, 2)
     assert (beacon.kind, beacon.transmitter_id) == (Kind.BEACON, 1)
     assert (text.kind, text.part) == (Kind.TEXT, b"Tempo 30")
-    said, (site,) = Beacon.unpack(beacon.part), sites_of(scene)
-    assert said.latitude_deg == pytest.approx(site.latitude_deg, abs=6e-10)
-    assert said.height_m == pytest.approx(site.height_m, abs=6e-4)
-    assert (said.heading_deg, said.tilt_deg) == pytest.approx((site.heading_deg, site.tilt_deg), abs=6e-3)
+    reported, (site,) = Beacon.unpack(beacon.part), sites_of(scene)
+    assert reported.latitude_deg == pytest.approx(site.latitude_deg, abs=6e-10)
+    assert reported.height_m == pytest.approx(site.height_m, abs=6e-4)
+    assert (reported.heading_deg, reported.tilt_deg) == pytest.approx(
+        (site.heading_deg, site.tilt_deg), abs=6e-3
+    )
 
 
 @pytest.mark.parametrize(
-    ("bar", "told"),
+    ("bar", "message"),
     [
         ({"payload": "messages"}, r'bars.0: payload = "messages": expected a text, or a \[world\]'),
         ({"payload": "data", "link": {"air": {"frames_per_packet": 2}}}, "bars.0: .* expected at least"),
@@ -142,8 +144,8 @@ def test_a_bar_in_the_world_sends_its_beacon() -> None:
         ({"payload": "data", "symbols": [[[0] * 16] * 10]}, "bars.0.payload = 'data': expected 'symbols'"),
     ],
 )
-def test_what_cannot_be_sent_is_told(bar: dict[str, Any], told: str) -> None:
-    with pytest.raises(ConfigError, match=told):
+def test_what_cannot_be_sent_is_reported(bar: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         sources_of(resolve_scene({"bars": [bar]}))
 
 
@@ -174,12 +176,12 @@ def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> No
     public = evlcp("tx", "keygen", key).out.strip()
     assert "a key is not overwritten" in evlcp("tx", "keygen", key).err
     assert evlcp("tx", "keygen", key, "--show").out.strip() == public
-    said = f"--text Tempo_30 --beacon {site} --key {key} --sequence 5 --chips {chips}"
-    assert evlcp("tx", "message", *said.split()).code == 0
+    message = f"--text Tempo_30 --beacon {site} --key {key} --sequence 5 --chips {chips}"
+    assert evlcp("tx", "message", *message.split()).code == 0
     settings = {"duration_s": 0.2, "bars.start_chip": 1380.0, "bars.chips_file": str(chips)}
     simulate(load_scene("drive-30kmh", settings)).save(rec)
-    told = evlcp("receive", rec, "-o", out, "--set", f'messages.trusted_keys=[{{key="{public}"}}]')
-    assert told.code == 0, told.err
+    reported = evlcp("receive", rec, "-o", out, "--set", f'messages.trusted_keys=[{{key="{public}"}}]')
+    assert reported.code == 0, reported.err
     lines = [json.loads(line) for line in (out / "packets.jsonl").read_text().splitlines()]
     messages = [line for line in lines if line["kind"] != "packet"]
     assert sorted((m["kind"], m["trust"]) for m in messages) == [
@@ -191,5 +193,5 @@ def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> No
     assert (text["text"], text["transmitter_id"], text["sequence"]) == ("Tempo_30", 7, 5)
     (beacon,) = (m for m in messages if m["verified"])
     assert (beacon["latitude_deg"], beacon["longitude_deg"], beacon["height_m"]) == (35.1, 136.9, 52.4)
-    assert "2 messages; beacons once verified, once unverified; how old verified ones are" in told.out
+    assert "2 messages; beacons once verified, once unverified; how old verified ones are" in reported.out
     assert beacon["reason"] == "signed 1970-01-01 00:00:05 UTC; when it was received is not known"

@@ -84,8 +84,8 @@ def test_the_truth_counts_what_was_rendered() -> None:
 @pytest.mark.parametrize("name", ["night-50m-30kmh", "tunnel-90m-30kmh"])
 def test_statistics_are_near_those_of_the_independent_recording(name: str) -> None:
     theirs = read_events(SHARED / f"{name}.raw")
-    told = json.loads((SHARED / f"{name}.truth.json").read_text())
-    ours = every(replace(scene_of_truth(told), duration_s=0.05), threads=2)
+    result = json.loads((SHARED / f"{name}.truth.json").read_text())
+    ours = every(replace(scene_of_truth(result), duration_s=0.05), threads=2)
     rate = [len(e) / (e.t_us[-1] - e.t_us[0]) for e in (ours, theirs)]
     assert rate[0] == pytest.approx(rate[1], rel=0.15)
     assert abs(float(ours.p.mean()) - float(theirs.p.mean())) < 0.05

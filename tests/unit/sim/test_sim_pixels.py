@@ -140,7 +140,7 @@ def test_latency_grows_with_the_lit_area(side: int) -> None:
     assert found == pytest.approx(model.MEASURED_AREA[side], rel=0.1)
 
 
-def test_columns_of_the_widest_sensor_are_told_apart() -> None:
+def test_columns_of_the_widest_sensor_are_distinguished() -> None:
     words = words_of(np.full(4, 10.0), [719, 718, 718, 719], [8191, 0, 4096, 1])
     events, *_ = served(words, 720, 1.0)
     assert events.x.tolist() == [0, 4096, 1, 8191]

@@ -107,7 +107,7 @@ def test_covers_put_out_clusters_and_only_those() -> None:
 
 
 @pytest.mark.parametrize(
-    ("keys", "says"),
+    ("keys", "message"),
     [
         ({"covered": (16,)}, "covered = [16]: expected clusters, 0 to 15"),
         ({"dead_leds": (96,)}, "dead_leds = [96]: expected LEDs, 0 to 95"),
@@ -116,10 +116,10 @@ def test_covers_put_out_clusters_and_only_those() -> None:
         ({"lattice_mps": 0.3}, "lattice_mps = 0.3: expected lattice_m beside it"),
     ],
 )
-def test_what_cannot_hide_a_bar_is_told(keys: dict[str, Any], says: str) -> None:
+def test_what_cannot_hide_a_bar_is_reported(keys: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as fault:
         BarLight(BarSpec(**keys), resolve({}), LensSpec(), 7)
-    assert says in str(fault.value)
+    assert message in str(fault.value)
 
 
 def test_leds_are_dead_stuck_dim_or_behind_slats() -> None:

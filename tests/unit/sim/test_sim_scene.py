@@ -35,7 +35,7 @@ def test_examples_can_be_rendered(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("table", "says"),
+    ("table", "message"),
     [
         ({"motion": {"distnce_m": 3.0}}, "motion.distnce_m = 3.0: unknown key; did you mean 'distance_m'?"),
         ({"bars": [{"z_m": -60.0}]}, "bars.0.z_m = -60.0: the bar is behind the camera"),
@@ -54,15 +54,15 @@ def test_examples_can_be_rendered(path: Path) -> None:
         ({"bars": [{"profile": "wh8"}]}, 'bars.0.profile = "wh8": unknown key; its link says it: bars.link'),
     ],
 )
-def test_faults_are_told_with_their_path(table: dict[str, Any], says: str) -> None:
+def test_faults_are_reported_with_their_path(table: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as fault:
         resolve_scene(table, source="s.toml")
     (line,) = str(fault.value).splitlines()
-    assert line.startswith(f"s.toml: {says}")
+    assert line.startswith(f"s.toml: {message}")
 
 
 @pytest.mark.parametrize(
-    ("override", "says"),
+    ("override", "message"),
     [
         ("nonsense", "--set nonsense: expected table.key=value"),
         ("mation.x=1", "--set mation.x: unknown table; did you mean 'motion'?"),
@@ -70,8 +70,8 @@ def test_faults_are_told_with_their_path(table: dict[str, Any], says: str) -> No
         ("bars.7.ppm=1", "--set bars.7.ppm: expected one of 1 bar, from 0 on"),
     ],
 )
-def test_wrong_overrides_are_told(override: str, says: str) -> None:
-    with pytest.raises(ConfigError, match=f"^{re.escape(says)}"):
+def test_wrong_overrides_are_reported(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{re.escape(message)}"):
         load_scene("night", [override])
 
 
@@ -102,14 +102,14 @@ def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
     texts = ["".join(map(str, row)) for row in np.tile(chips, (2, 1)).T]
     assert sent.longest_us == 100 * max(len(run) for text in texts for run in re.findall("0+|1+", text))
     (tmp_path / "text.npy").write_text("chips")
-    for link, wrong, says in (
+    for link, wrong, message in (
         (LINK, {"symbols": ((tuple(range(16)),),)}, r"bars\.0\.symbols\.0: 1 frames, expected 10"),
         (LINK, {"symbols": (((99,) * 16,) * 10,)}, r"symbol 99 .*expected 0 to 63"),
         (resolve({"bar": {"rows": 48}}), {"chips_file": str(tmp_path / "chips.npy")}, "8 clusters"),
         (LINK, {"chips_file": str(tmp_path / "no.npy")}, "cannot be read"),
         (LINK, {"chips_file": str(tmp_path / "text.npy")}, r"not a \.npy file of plain numbers"),
     ):
-        with pytest.raises(EvlcpError, match=says):
+        with pytest.raises(EvlcpError, match=message):
             BarLight(BarSpec(**wrong), link, LensSpec(), 0, "bars.0")
 
 
@@ -141,13 +141,13 @@ def test_a_path_of_a_file_is_followed(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"lasts from 0\.0 to 0\.2 s"):
         Simulation(load_scene(tmp_path / "scene.toml", ["duration_s=0.3"]))
     ahead = [line.replace("-", "") for line in lines]
-    for wrong, says in (
+    for wrong, message in (
         (ahead, r"bars\.0: the bar is behind the camera .*depth -40\.00 m"),
         ([lines[0], "0,0,0,x,0,0,0"], "line 2: z_m = 'x': expected a number"),
         ([lines[0], lines[2], lines[1]], "rising t_s"),
     ):
         (tmp_path / "path.csv").write_text("\n".join(wrong))
-        with pytest.raises(ConfigError, match=says):
+        with pytest.raises(ConfigError, match=message):
             Simulation(scene)
     (tmp_path / "path.csv").unlink()
     with pytest.raises(InputError, match="cannot be read"):
@@ -195,7 +195,7 @@ def test_simulate_writes_a_recording_and_its_truth(tmp_path, evlcp, monkeypatch)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "says"),
+    ("arguments", "code", "message"),
     [
         (("--preset", "nigt", "-o", "a.raw"), 2, "no preset named 'nigt'; did you mean 'night'?"),
         (("--preset", "night", "-o", "no/a.raw"), 1, "no/a.raw: cannot be written"),
@@ -209,9 +209,9 @@ def test_simulate_writes_a_recording_and_its_truth(tmp_path, evlcp, monkeypatch)
         (("drive-30kmh", "-o", "a.raw"), 2, "drive-30kmh: no such file; for the preset: --preset drive-30km"),
     ],
 )
-def test_simulate_tells_what_is_wrong(arguments, code, says, tmp_path, evlcp, monkeypatch) -> None:
+def test_simulate_tells_what_is_wrong(arguments, code, message, tmp_path, evlcp, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     done = evlcp("simulate", *arguments)
     assert done.code == code
-    assert says in " ".join(done.err.replace("│", " ").split())
+    assert message in " ".join(done.err.replace("│", " ").split())
     assert list(tmp_path.iterdir()) == []

@@ -71,7 +71,7 @@ def test_a_file_without_a_link_is_of_the_default_link() -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "says"),
+    ("path", "value", "message"),
     [
         ("bars", 3, "bars = 3: expected a list"),
         ("t_s", [1.0, 0.5], "t_s = [1.0, 0.5]: expected rising times"),
@@ -87,7 +87,9 @@ def test_a_file_without_a_link_is_of_the_default_link() -> None:
         ("scene.t0_us", 10**400, "expected a finite number"),
     ],
 )
-def test_what_no_truth_says_is_refused_in_one_line(path: str, value: Any, says: str, tmp_path: Path) -> None:
+def test_what_no_truth_says_is_refused_in_one_line(
+    path: str, value: Any, message: str, tmp_path: Path
+) -> None:
     table = plain(truth_of(load_scene("night", ["duration_s=0.05"])))
     holder: Any = table
     *above, last = path.split(".")
@@ -97,7 +99,7 @@ def test_what_no_truth_says_is_refused_in_one_line(path: str, value: Any, says: 
     (tmp_path / "t.json").write_text(json.dumps(table))
     with pytest.raises(InputError) as fault:
         read_truth(tmp_path / "t.json")
-    assert says in str(fault.value)
+    assert message in str(fault.value)
     assert str(fault.value).startswith(f"{tmp_path}/t.json: ")
     assert len(str(fault.value).splitlines()) == 1
 

@@ -101,17 +101,17 @@ def test_what_an_imu_does_not_know(known: str) -> None:
         assert (log.heading_deg is None) == (known == "gravity")
 
 
-def test_what_is_said_of_sites_is_wrong_as_told() -> None:
+def test_what_is_stated_of_sites_is_wrong_as_declared() -> None:
     assert surveyed_sites(SCENE, 5) == sites_of(SCENE)
     one, two, three = SCENE.bars
     swapped = (replace(one, site_of=1), replace(two, site_of=0, site_off_m=(0.3, -0.4, 1.2)), three)
     wrong = replace(SCENE, bars=swapped)
-    true, said = sites_of(wrong), surveyed_sites(wrong, 5)
+    true, reported = sites_of(wrong), surveyed_sites(wrong, 5)
     assert true == sites_of(SCENE)
-    assert [s.transmitter_id for s in said] == [1, 77, 3]
-    assert replace(said[0], transmitter_id=77) == true[1]
-    assert said[2] == true[2]
-    np.testing.assert_allclose(off_m(said[1], true[0]), [0.3, -0.4, 1.2], atol=1e-5)
+    assert [s.transmitter_id for s in reported] == [1, 77, 3]
+    assert replace(reported[0], transmitter_id=77) == true[1]
+    assert reported[2] == true[2]
+    np.testing.assert_allclose(off_m(reported[1], true[0]), [0.3, -0.4, 1.2], atol=1e-5)
     with pytest.raises(ConfigError, match=r"bars\.2\.site_of = 3: expected one of 3 bars"):
         surveyed_sites(replace(wrong, bars=(one, two, replace(three, site_of=3))), 5)
 
@@ -132,7 +132,7 @@ def test_a_survey_errs_by_what_it_says() -> None:
     np.testing.assert_allclose(np.std(errors, 0), 0.2, rtol=0.16)
 
 
-def test_what_is_said_of_the_attitude_is_wrong_as_told() -> None:
+def test_what_is_stated_of_the_attitude_is_wrong_as_declared() -> None:
     assert SCENE.world is not None
     scene = replace(SCENE, duration_s=0.1, motion=replace(SCENE.motion, vib_rate_rad_s=0.2))
     simulation = Simulation(scene)

@@ -116,17 +116,17 @@ def score(rows: list[Row], truth: dict[str, Any], lengths: Lengths, *, road: boo
         _, wanted, true_m, whole, part = best["sent"][j]
         got = row["symbols"].split()
         for k, symbol in enumerate(wanted):
-            said = got[k] if k < len(got) else "-"
+            reported = got[k] if k < len(got) else "-"
             if k in whole:
                 best["hidden"] += 1
-                best["claimed"] += said != "-"
+                best["claimed"] += reported != "-"
             elif k not in part:
                 best["visible"] += 1
-                if said == "-":
+                if reported == "-":
                     best["erased"] += 1
                 else:
                     best["bits"] += lengths.bits
-                    best["wrong"] += (int(said) ^ symbol).bit_count()
+                    best["wrong"] += (int(reported) ^ symbol).bit_count()
         if row.get("distance_m"):
             error = float(row["distance_m"]) - true_m
             best["errors"].append(error)

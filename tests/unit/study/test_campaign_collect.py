@@ -219,9 +219,9 @@ def test_a_scheduler_that_dies_keeps_what_was_finished(cluster: Cluster, tmp_pat
         if progress.done == 40:
             cluster.processes[0].kill()
 
-    with pytest.raises(EvlcpError, match="scheduler is gone; what was finished is kept") as told:
+    with pytest.raises(EvlcpError, match="scheduler is gone; what was finished is kept") as caught:
         collected(plan, tmp_path / "a.sqlite", DaskCluster(cluster.address), watch)
-    assert len(str(told.value).splitlines()) == 1
+    assert len(str(caught.value).splitlines()) == 1
     assert kept(tmp_path / "a.sqlite") >= 40
 
 
@@ -249,8 +249,8 @@ def test_processes_give_what_this_one_gives(evlcp, demo_raw: Path, tmp_path: Pat
     assert done.code == 3
     assert done.err.startswith(f"evlcp: {tmp_path}/bad.raw: ")
     assert len(done.err.splitlines()) == 1
-    told = [json.loads(line) for line in done.out.splitlines()]
-    assert sorted(t["status"] for t in told) == ["complete"] * 2 + ["failed"]
+    reported = [json.loads(line) for line in done.out.splitlines()]
+    assert sorted(t["status"] for t in reported) == ["complete"] * 2 + ["failed"]
     assert evlcp("receive", demo_raw, "-o", tmp_path / "one").code == 0
     expected = (tmp_path / "one" / "frames.csv").read_bytes()
     for path in two:

@@ -84,7 +84,7 @@ def test_an_id_follows_everything_that_determines_the_result_and_nothing_else(tm
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "message"),
     [
         ("seeds = 3", "seeds = 0", "c.toml: campaign.seeds = 0: expected greater than or equal to 1"),
         ("[20, 30]", "20", "c.toml: scene.grid.speed_kmh = 20: expected a list of values"),
@@ -93,22 +93,22 @@ def test_an_id_follows_everything_that_determines_the_result_and_nothing_else(tm
         ("seeds = 3", 'seeds = 3\nmerge = ["scene.speed"]', "campaign.merge: 'scene.speed' is not varied"),
     ],
 )
-def test_faults_are_reported_with_their_path(tmp_path: Path, old: str, new: str, told: str) -> None:
+def test_faults_are_reported_with_their_path(tmp_path: Path, old: str, new: str, message: str) -> None:
     with pytest.raises(ConfigError) as fault:
         plan_of(tmp_path, TEXT.replace(old, new))
-    assert told in str(fault.value)
+    assert message in str(fault.value)
 
 
 @pytest.mark.parametrize(
-    ("seeds", "grids", "told"),
+    ("seeds", "grids", "message"),
     [
         (3, {"scene": "abcde"}, "scene: 714924299 cases of grid and variants, expected at most 10000"),
         (1000, {"scene": "a", "link": "b"}, "59 scenes x 59 links x 1000 seeds: 3481000 tasks, expected at"),
     ],
 )
-def test_a_grid_of_too_many_points_is_refused_at_once(tmp_path, seeds, grids, told) -> None:
+def test_a_grid_of_too_many_points_is_refused_at_once(tmp_path, seeds, grids, message) -> None:
     axes = [f"{part}.grid.{axis} = {list(range(59))}" for part, some in grids.items() for axis in some]
-    with pytest.raises(ConfigError, match=told):
+    with pytest.raises(ConfigError, match=message):
         plan_of(tmp_path, "\n".join([*axes, f'campaign = {{ name = "x", seeds = {seeds} }}']))
 
 

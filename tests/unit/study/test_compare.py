@@ -162,7 +162,7 @@ def test_json_csv_and_html_parse_back() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("joint", "--variant joint: expected NAME:TABLE.KEY=VALUE"),
         (":ranging.id=poc", "expected NAME:"),
@@ -171,10 +171,10 @@ def test_json_csv_and_html_parse_back() -> None:
         ("base:ranging.id=centroid", "the name 'base' is taken"),
     ],
 )
-def test_variants_that_cannot_be(text: str, told: str) -> None:
+def test_variants_that_cannot_be(text: str, message: str) -> None:
     with pytest.raises(ConfigError) as fault:
         load_variants(["base:", text])
-    assert told in str(fault.value)
+    assert message in str(fault.value)
     assert len(str(fault.value).splitlines()) == 1
 
 

@@ -90,8 +90,8 @@ def test_all_commands_agree(name: str, evlcp, tmp_path: Path) -> None:
     assert road["ber"] == 0
     assert road["erased"] <= 0.02
 
-    told = json.loads(run(evlcp, "compare", raw, "--variant", "it:", *options(link), "--json"))
-    (row,) = told["rows"]
+    result = json.loads(run(evlcp, "compare", raw, "--variant", "it:", *options(link), "--json"))
+    (row,) = result["rows"]
     in_scene, in_link = (
         "".join(f"set.{key} = {to_toml_value(value)}\n" for key, value in some.items())
         for some in (scene, link)
@@ -167,10 +167,10 @@ def received(scene: Scene) -> Tally:
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"),
+    ("settings", "message"),
     [({"bar.rows": 48}, "bar.rows: sent with 96, received with 48"), ({"error-correction.id": "none"}, None)],
 )
-def test_another_link_is_refused_by_all(settings, says, evlcp, tmp_path) -> None:
+def test_another_link_is_refused_by_all(settings, message, evlcp, tmp_path) -> None:
     raw, campaign = tmp_path / "r.raw", tmp_path / "c.toml"
     run(evlcp, "simulate", "--preset", "night", "-o", raw, "--set", "duration_s=0.002")
     run(evlcp, "receive", raw, "-o", tmp_path / "out", *options(settings))
@@ -187,9 +187,9 @@ def test_another_link_is_refused_by_all(settings, says, evlcp, tmp_path) -> None
         ),
     ):
         done = evlcp(*command)
-        assert done.code == (0 if says is None else 2), name
-        line = f"evlcp: {place}: bar 0 was sent with another link: {says}\n"
-        assert done.err == ("" if says is None else line)
+        assert done.code == (0 if message is None else 2), name
+        line = f"evlcp: {place}: bar 0 was sent with another link: {message}\n"
+        assert done.err == ("" if message is None else line)
 
 
 def test_links_that_share_what_is_on_air_share_a_rendering(evlcp, tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def test_the_numbers_are_those_of_both_independent_scorers(name, tmp_path, evlcp
     path = tmp_path / "REC.truth.json"
     path.write_text(json.dumps(truth))
     theirs, road = (runpy.run_path(str(tool))["score"](tmp_path, path) for tool in TOOLS)
-    done, told = evlcp("score", tmp_path, path, "--json"), evlcp("score", tmp_path, path).out
+    done, reported = evlcp("score", tmp_path, path, "--json"), evlcp("score", tmp_path, path).out
     assert done.err.startswith(f"evlcp: {tmp_path}/summary.json: not there")
     mine = json.loads(done.out)
     # They know nothing of two bars in one place, and one that is cut beside one that was found is no match.
@@ -85,13 +85,13 @@ def test_the_numbers_are_those_of_both_independent_scorers(name, tmp_path, evlcp
         return
     assert mine["road"]["unmatched"] <= road["unmatched"]
     assert mine == theirs | {"road": road | {"unmatched": mine["road"]["unmatched"]}}
-    assert told.startswith(f"rows {theirs['rows']}, matching no true frame {theirs['unmatched']}\n")
-    assert f"said to be reflections {road['echoes']}\n" in told
+    assert reported.startswith(f"rows {theirs['rows']}, matching no true frame {theirs['unmatched']}\n")
+    assert f"said to be reflections {road['echoes']}\n" in reported
     if name == "covered":
         bar = road["bars"][0]
         assert theirs["bars"][0]["bit_errors"] > bar["bit_errors"] > 0
         assert min(theirs["unmatched"], mine["road"]["unmatched"], road["echoes"], bar["claimed"]) > 0
-        assert f"NEES {bar['nees']}" in told
+        assert f"NEES {bar['nees']}" in reported
 
 
 LINKS = {
@@ -124,13 +124,13 @@ def truth_with(table: Table, lengths: Lengths, seed: int = 1) -> Table:
             {"link": link.digest, "symbols": symbols, "start_chip": start_chip, "ppm": ppm, "led_w_m2": None}
             | {"chips_file": None, "covered": [0], "cover_s": cover, "pole_s": pole}
         )
-    said = {"table": plain({section: dict(keys) for section, keys in link.table.items()})}
-    said |= {"codebook": link.codebook.digest, "revisions": dict(link.revisions)}
+    reported = {"table": plain({section: dict(keys) for section, keys in link.table.items()})}
+    reported |= {"codebook": link.codebook.digest, "revisions": dict(link.revisions)}
     rows = np.full_like(t_s, 300.0)
     return {
         "scene": {"t0_us": 777, "duration_s": duration_s},
         "bars": bars,
-        "links": {link.digest: said},
+        "links": {link.digest: reported},
         "t_s": t_s.tolist(),
         "distance_m": np.stack([52 - 20 * t_s, 48 - 20 * t_s]).tolist(),
         "bar_centre_px": np.stack([[600 + 100 * t_s, rows], [700 - 9 * t_s, rows]]).tolist(),
@@ -209,7 +209,7 @@ SCENE = json.dumps(truth_of(Scene(duration_s=0.05)).to_table())
 
 
 @pytest.mark.parametrize(
-    ("frames", "truth", "summary", "code", "says"),
+    ("frames", "truth", "summary", "code", "message"),
     [
         (None, "{}", None, 3, "frames.csv: cannot be read"),
         ("", "{}", None, 3, "frames.csv: without the columns transmitter, t_us"),
@@ -225,14 +225,14 @@ SCENE = json.dumps(truth_of(Scene(duration_s=0.05)).to_table())
     ],
 )  # fmt: skip
 def test_what_cannot_be_scored_is_reported_in_one_line(
-    frames, truth, summary, code, says, tmp_path, evlcp
+    frames, truth, summary, code, message, tmp_path, evlcp
 ) -> None:
     for name, text in (("frames.csv", frames), ("t.json", truth), ("summary.json", summary)):
         if text is not None:
             (tmp_path / name).write_text(text)
     done = evlcp("score", tmp_path, tmp_path / "t.json")
     assert done.code == code
-    assert says in done.err
+    assert message in done.err
     assert len(done.err.splitlines()) == 1
     assert summary is None or done.err.startswith(f"evlcp: {tmp_path}/summary.json: ")
 

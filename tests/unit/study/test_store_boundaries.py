@@ -158,7 +158,7 @@ def test_what_was_changed_is_taken_or_refused_in_one_line(results, plan, changed
 
 
 @pytest.mark.parametrize(
-    ("body", "says"),
+    ("body", "message"),
     [
         ({"seeds": [HOSTILE]}, "seeds.0 = "),
         *(({"seeds": []}, "seeds"), ({"scenes": {}}, "scenes"), ({"rule": None}, "rule")),
@@ -166,11 +166,11 @@ def test_what_was_changed_is_taken_or_refused_in_one_line(results, plan, changed
     ],
     ids=lambda value: str(value)[:20],
 )
-def test_what_is_no_plan_is_named_in_one_line(results, plan, body, says) -> None:
+def test_what_is_no_plan_is_named_in_one_line(results, plan, body, message) -> None:
     keep(results, body if isinstance(body, str) else json.dumps(plan | body))
     line = refusal(lambda: read(results)) or ""
     assert "a.sqlite: damaged, or no results file of evlcp sweep" in line
-    assert says in line
+    assert message in line
     assert len(line.splitlines()) == 1
     assert len(line) < 500
 

@@ -69,17 +69,17 @@ def test_from_a_file_to_figures(evlcp, campaign: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "told"),
+    ("overrides", "message"),
     [
         (["scene.bars.z_m=-100"], "the bar is behind the camera"),
         (["seeds=0"], "--set seeds=0: expected campaign.KEY="),
     ],
 )
-def test_bad_campaigns_are_one_line(evlcp, campaign, tmp_path, overrides, told) -> None:
+def test_bad_campaigns_are_one_line(evlcp, campaign, tmp_path, overrides, message) -> None:
     options = [part for text in overrides for part in ("--set", text)]
     done = evlcp("sweep", campaign, "-o", tmp_path / "r.sqlite", *options)
     assert done.code == 2
-    assert told in done.err
+    assert message in done.err
     assert len(done.err.splitlines()) <= 2
     assert not (tmp_path / "r.sqlite").exists()
 
