@@ -22,16 +22,16 @@ BEST = ("decoding.id=motion-feedback", "ranging.id=joint-scale", "tracking.id=ka
 
 
 @cache
-def rendered(scene: str, seed: int, settings: tuple[str, ...]) -> tuple[Events, Truth]:
+def render(scene: str, seed: int, settings: tuple[str, ...]) -> tuple[Events, Truth]:
     cut = load_scene(scene if scene.startswith("drive") else SCENES / f"{scene}.toml", settings)
     return Events.concat(Simulation(cut, seed).stream()), truth_of(cut, seed=seed)
 
 
-def received(scene: str, seeds: Iterable[int], settings: tuple[str, ...], link: tuple[str, ...]) -> Tally:
+def score_scene(scene: str, seeds: Iterable[int], settings: tuple[str, ...], link: tuple[str, ...]) -> Tally:
     """What a link finds in a scene, over seeds."""
     total = Tally()
     for seed in seeds:
-        events, truth = rendered(scene, seed, settings)
+        events, truth = render(scene, seed, settings)
         receiver = Receiver(load_link(overrides=link))
         packets = receiver.feed(events) + receiver.close()
         # A last frame whose end is not quite in the recording counts as not sent, and so as a ghost.
@@ -47,7 +47,7 @@ def received(scene: str, seeds: Iterable[int], settings: tuple[str, ...], link: 
 def test_a_fast_drive_that_shakes(distance_m: float, link: tuple[str, ...]) -> None:
     """80 km/h with twice the vibration: the bit error rate far, midway and near."""
     cut = (f"motion.distance_m={distance_m}", "duration_s=0.15")
-    found = received("fast-drive", (1, 2), cut, link)
+    found = score_scene("fast-drive", (1, 2), cut, link)
     assert found.frames_found >= 0.95 * found.frames_sent
     assert found.ber <= 0.01
     assert found.ranged == found.frames_found
@@ -57,7 +57,7 @@ def test_motion_feedback_helps() -> None:
     """Motion that is left where regions are not followed well costs bits: half of them and more come back."""
     cut = ("motion.distance_m=90.0", "motion.vib_rate_rad_s=0.24", "duration_s=0.3")
     links = (("decoding.id=ml-soft",), ("decoding.id=motion-feedback",))
-    soft, feedback = (received("fast-drive", (6, 10), cut, link) for link in links)
+    soft, feedback = (score_scene("fast-drive", (6, 10), cut, link) for link in links)
     assert soft.bit_errors >= 10
     assert feedback.bit_errors <= 0.5 * soft.bit_errors
 

@@ -27,7 +27,9 @@ NAMES = (
 )
 
 
-def scored(name: str, link: Link, events: Path | None = None, attitude: Attitude | None = None) -> Statistics:
+def score_recording(
+    name: str, link: Link, events: Path | None = None, attitude: Attitude | None = None
+) -> Statistics:
     """What a link finds in a recording, or in what is left of its events."""
     recording = RECORDINGS / f"{name}.raw"
     with receive(events or recording, link, attitude=attitude) as packets:
@@ -37,10 +39,10 @@ def scored(name: str, link: Link, events: Path | None = None, attitude: Attitude
 
 
 @cache
-def received(name: str, *settings: str) -> Statistics:
+def score_with(name: str, *settings: str) -> Statistics:
     """What is found with some settings."""
     profile = "wh8" if name.startswith("wh8") else "wh4x2"
-    return scored(name, load_link(overrides=[f"modulation.id={profile}", *settings]))
+    return score_recording(name, load_link(overrides=[f"modulation.id={profile}", *settings]))
 
 
 PAPER = ("decoding.id=wh-transform", "ranging.id=poc")
@@ -50,7 +52,7 @@ JOINT = ("ranging.id=joint-scale", "tracking.id=kalman")
 @pytest.mark.parametrize("name", NAMES)
 def test_one_fit_over_all_boundaries_is_better(name: str) -> None:
     """The best variant has at most 0.75 of the paper's error, filtered 0.4 of it."""
-    paper, joint = (received(name, *settings).total() for settings in (PAPER, JOINT))
+    paper, joint = (score_with(name, *settings).total() for settings in (PAPER, JOINT))
     assert joint.rmse_m <= 0.75 * paper.rmse_m
     assert joint.filtered_rmse_m <= 0.4 * paper.rmse_m
 
@@ -63,7 +65,7 @@ def test_one_fit_over_all_boundaries_is_better(name: str) -> None:
 )
 def test_every_variant_reads_every_recording(settings: tuple[str, ...], name: str) -> None:
     """No wrong bit to 60 m, 1 in 1000 to 100 m; no distance half a metre off to 60 m."""
-    found = received(name, *settings)
+    found = score_with(name, *settings)
     assert found.total().frames_found >= 0.9 * found.total().frames_sent
     for start_m, bars in found.segments.items():
         near = start_m < 60
@@ -77,7 +79,7 @@ def test_positive_events_suffice(name: str, tmp_path: Path) -> None:
     """A camera that sends no negative events is still read, within the paper's bit error rate."""
     events = read_events(RECORDINGS / f"{name}.raw")
     write_events(tmp_path / "positive.raw", events[events.p == 1], 1280, 720)
-    found = scored(name, load_link(), tmp_path / "positive.raw").total()
+    found = score_recording(name, load_link(), tmp_path / "positive.raw").total()
     assert found.frames_found >= 0.9 * found.frames_sent
     assert found.ber <= 0.01
     assert found.erased <= 0.02 * found.visible
@@ -87,7 +89,8 @@ def test_a_pitch_is_corrected() -> None:
     """One angle for all of a drive with vibration: what the bend alone makes of it is twice as far off."""
     attitudes = Attitude(4.0, 0.0, gravity_sigma_deg=0.3), None
     known, unknown = (
-        scored("road/pitch-4deg-45m", load_link(), attitude=attitude).total() for attitude in attitudes
+        score_recording("road/pitch-4deg-45m", load_link(), attitude=attitude).total()
+        for attitude in attitudes
     )
     assert known.rmse_m < 0.02 < unknown.rmse_m
     assert 0.5 < known.nees < 2
@@ -95,7 +98,7 @@ def test_a_pitch_is_corrected() -> None:
 
 
 def test_a_corner_of_a_lens_that_distorts() -> None:
-    found = scored("road2/k1-corner-45m", load_link(overrides=["camera.k1=-0.25"])).total()
+    found = score_recording("road2/k1-corner-45m", load_link(overrides=["camera.k1=-0.25"])).total()
     assert found.frames_found == found.frames_sent
     assert found.bit_errors == 0
     assert found.rmse_m < 0.025

@@ -69,7 +69,7 @@ def state_of(board):
     return status.state, status.faults
 
 
-def shown(device):
+def shown_chips(device):
     """What each LED did since the last look, uint8 (chips, 96)."""
     return device.records().played().chips(None)
 

@@ -5,7 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from board_lines import board_link, board_on, check_fault, options_of, shown, some_bank, symbols_of, well
+from board_lines import (
+    board_link,
+    board_on,
+    check_fault,
+    options_of,
+    shown_chips,
+    some_bank,
+    symbols_of,
+    well,
+)
 from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk.air.codebook import Codebook, hadamard
@@ -109,7 +118,7 @@ def test_every_led_does_what_it_is_sent(device, board, form, overrides):
         stream.wait(0.1)
         for packet in symbols:
             stream.send(packet)
-    rows = shown(device)
+    rows = shown_chips(device)
     assert (rows[-len(leds) :] == leds).all()
     assert not rows[:, len(bank.led_clusters) :].any()
     assert board.status().faults == 0
@@ -142,7 +151,7 @@ def test_any_clusters_of_any_leds(data):
     provision(board, bank, Settings())
     device.run(data.draw(st.integers(1, 400)) * 100)
     assert board.verify(bank) == 0
-    check_round(shown(device), leds_of(chips, which), 1)
+    check_round(shown_chips(device), leds_of(chips, which), 1)
     assert board.status().duty == bank.duty == np.ceil(1000 * chips.mean(0).max() - 1e-9)
 
 
@@ -153,7 +162,7 @@ def test_idle_keeps_to_the_limits(device, board, limit, every):
     bank = Bank.of_chips(np.zeros((151, 10), np.uint8), BOOK, packet, LED_CLUSTERS)
     provision(board, bank, Settings(watchdog=Watchdog.IDLE, watchdog_ms=100, duty_limit=limit))
     device.run(700_000)
-    on = np.flatnonzero(shown(device)[:, 0])
+    on = np.flatnonzero(shown_chips(device)[:, 0])
     assert (np.diff(on) == every).all()
     assert len(on) >= 5
     assert on[0] % 151 == every - 1 if every < 151 else True
@@ -237,13 +246,13 @@ def test_chips_that_the_board_has_none_as_long_as(device, board):
     assert (status.chip_rate_hz, status.hold) == (2000, 2)
     device.run(800_000)
     wanted = symbol_chips(symbols, link.codebook, 4).repeat(6, axis=1).repeat(2, axis=0)
-    check_round(shown(device), wanted, 1500)
+    check_round(shown_chips(device), wanted, 1500)
     assert board.verify(bank) == 0
     assert not board.program(bank).swapped
     with board.stream(link) as stream:
         stream.send(symbols[0])
     packet = 2 * link.packet.packet_chips
-    assert (shown(device)[-packet:] == wanted[:packet]).all()
+    assert (shown_chips(device)[-packet:] == wanted[:packet]).all()
 
 
 ANY = ("bar.rows=90", "bar.cluster_rows=9", "pilots.id=barker13")

@@ -21,7 +21,7 @@ from firmware_host.ports.rom import SECTORS, RomLoader, flash_image
 from tests.models.rom import RomEmulator, RomLine
 
 
-def some(count, seed=0, address=FLASH_START):
+def random_image(count, seed=0, address=FLASH_START):
     return FlashImage(address, np.random.default_rng(seed).integers(0, 256, count, np.uint8).tobytes())
 
 
@@ -58,8 +58,8 @@ def test_damaged_images_are_reported(tmp_path, name, content, message):
 
 
 def test_flashed_read_back_started_and_the_rest_left_alone():
-    old, end = some(1 << 20, 1).data, sum(SECTORS[:5])
-    rom, new = RomEmulator(old), some(70_001, 2)
+    old, end = random_image(1 << 20, 1).data, sum(SECTORS[:5])
+    rom, new = RomEmulator(old), random_image(70_001, 2)
     reports = []
     loader = RomLoader(RomLine(rom))
     sectors = flash_image(loader, new, progress=lambda done, total: reports.append((done, total)))
@@ -70,7 +70,7 @@ def test_flashed_read_back_started_and_the_rest_left_alone():
     assert reports == sorted(reports)
     # one elsewhere takes its own sectors
     rom = RomEmulator(bytes(1 << 20))
-    flash_image(RomLoader(RomLine(rom)), some(10, 3, FLASH_START + (128 << 10) - 4), start=False)
+    flash_image(RomLoader(RomLine(rom)), random_image(10, 3, FLASH_START + (128 << 10) - 4), start=False)
     assert (rom.erased, rom.started) == ([4, 5], None)
 
 
@@ -91,7 +91,7 @@ class BadLine(RomLine):
 def test_a_bad_line_gets_through_or_is_reported():
     through = 0
     for seed in range(12):
-        rom, new = RomEmulator(), some(6_000, seed)
+        rom, new = RomEmulator(), random_image(6_000, seed)
         with suppress(LineError, RefusedError, VerifyError, NoBoardError):
             flash_image(RomLoader(BadLine(rom, seed, 3_000)), new)
             through += 1
@@ -136,16 +136,16 @@ def test_what_cannot_be_flashed_is_reported():
     # a line that ends in the middle is told, and the next run goes through
     rom = RomEmulator()
     with pytest.raises(LineError, match="no answer to WRITE at 0x8000"):
-        flash_image(RomLoader(Cut(rom, 3_000)), some(6_000))
-    flash_image(RomLoader(RomLine(rom)), some(6_000))
-    assert rom.flash[:6_000] == some(6_000).data
+        flash_image(RomLoader(Cut(rom, 3_000)), random_image(6_000))
+    flash_image(RomLoader(RomLine(rom)), random_image(6_000))
+    assert rom.flash[:6_000] == random_image(6_000).data
 
 
 def test_what_the_command_flashes_boots_where_it_was_flashed(evlcp, tmp_path):
     needs("arm-none-eabi-gcc")
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
     port, kept = f"unix:{tmp_path / 'part'}", tmp_path / "flash.bin"
-    kept.write_bytes(some(1 << 20, 5).data)
+    kept.write_bytes(random_image(1 << 20, 5).data)
     emulated = Emulated("rom", "--listen", port, "--flash", kept)
     try:
         assert emulated.said == f"listening on {port}\n"
@@ -172,7 +172,7 @@ def test_what_the_command_flashes_boots_where_it_was_flashed(evlcp, tmp_path):
 
 
 def test_the_image_for_another_crystal_boots_by_that_one(stm32):
-    rom = RomEmulator(some(1 << 20, 5).data)
+    rom = RomEmulator(random_image(1 << 20, 5).data)
     flash_image(RomLoader(RomLine(rom)), FlashImage.read(build.arm_image("stm32f405-12mhz")))
     flash = FlashImage(FLASH_START, bytes(rom.flash))
     _, board = stm32(flash, 12_000_000)
@@ -183,7 +183,7 @@ def test_the_image_for_another_crystal_boots_by_that_one(stm32):
 
 
 def test_a_part_without_brown_out_is_reported(evlcp, tmp_path):
-    (tmp_path / "image.bin").write_bytes(some(1_000).data)
+    (tmp_path / "image.bin").write_bytes(random_image(1_000).data)
     for warns, options in ((True, ()), (False, ("--brown-out",))):
         rom = RomEmulator()
         before = bytes(rom.options)

@@ -22,7 +22,7 @@ serial = pytest.importorskip("serial")
 Fault = serial.SerialException
 
 
-def listed(device, vid=None, pid=None, number=None):
+def listed_port(device, vid=None, pid=None, number=None):
     """A port as pyserial lists it."""
     return SimpleNamespace(device=device, description=f"{device} n/a", vid=vid, pid=pid, serial_number=number)
 
@@ -39,7 +39,11 @@ def pty_name():
 
 @pytest.fixture
 def ports(monkeypatch):
-    found = [listed("COM7", 0x0403, 0x6015, "D30A1"), listed("COM3"), listed("COM9", 0x1546, 0x01A9, "gps")]
+    found = [
+        listed_port("COM7", 0x0403, 0x6015, "D30A1"),
+        listed_port("COM3"),
+        listed_port("COM9", 0x1546, 0x01A9, "gps"),
+    ]
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: found)
     return found
 
@@ -83,7 +87,7 @@ def test_a_usb_id_must_be_one(ports, opened):
             UsbFilter.parse(wrong)
     with pytest.raises(NoBoardError, match="COM7: cannot be opened"):
         open_transport("usb:0403")
-    ports.append(listed("COM8", 0x0403, 0x6015, "D30A2"))
+    ports.append(listed_port("COM8", 0x0403, 0x6015, "D30A2"))
     with pytest.raises(NoBoardError, match=r"2 ports have it: COM7 \(serial number D30A1\), COM8"):
         open_transport("usb:0403:6015")
     assert opened() == ["COM7"]
@@ -108,7 +112,7 @@ def test_a_real_tty_gets_no_byte(monkeypatch, evlcp, pty_name):
     """What hangs on a port of no bridge hears nothing of the search."""
     ours, port = pty_name
     os.set_blocking(ours, False)
-    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [listed(port)])
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [listed_port(port)])
     assert evlcp("board", "hello").code == 4
     with pytest.raises(BlockingIOError):
         os.read(ours, 100)

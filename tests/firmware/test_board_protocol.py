@@ -150,7 +150,7 @@ def reply(request, payload=b"", status=0):
     return Datagram(request.type | 0x80, status, request.sequence, request.session, payload).encode()
 
 
-def sent(client, now=0.0):
+def sent_bytes(client, now=0.0):
     """What the client writes then."""
     return DatagramDecoder().feed(client.poll(now)[0])
 
@@ -158,12 +158,12 @@ def sent(client, now=0.0):
 def test_window_bounds_what_is_under_way():
     client = Client(Timing(), window=3)
     tokens = [client.submit(messages.CrcRequest(0, i, 1)) for i in range(5)]
-    first = sent(client)
+    first = sent_bytes(client)
     assert len(first) == 3
     assert not client.room
     done = client.receive(reply(first[1], messages.CrcReply(9).pack()))
     assert [(o.token, o.reply) for o in done] == [(tokens[1], messages.CrcReply(9))]
-    assert len(sent(client)) == 1
+    assert len(sent_bytes(client)) == 1
 
 
 def test_tries_back_off_and_end():
@@ -189,7 +189,7 @@ def test_tries_back_off_and_end():
 def test_late_doubled_and_foreign_answers_are_ignored():
     client = Client(Timing(), first=0xFFFF)
     client.submit(messages.CrcRequest(0, 0, 1))
-    request = sent(client)[0]
+    request = sent_bytes(client)[0]
     assert request.sequence == 0xFFFF
     answer = messages.CrcReply(9).pack()
     other = Datagram(request.type, 0, 5, 0, b"")
@@ -201,14 +201,14 @@ def test_late_doubled_and_foreign_answers_are_ignored():
     assert client.receive(reply(request, answer))[0].reply == messages.CrcReply(9)
     assert client.receive(reply(request, answer)) == []
     client.submit(messages.StatusRequest())
-    assert sent(client, 1.0)[0].sequence == 0
+    assert sent_bytes(client, 1.0)[0].sequence == 0
 
 
 def test_refusal_carries_status_and_detail():
     client = Client(Timing())
     for status in (messages.Status.OUT_OF_RANGE, 99):
         client.submit(messages.StopRequest())
-        request = sent(client)[0]
+        request = sent_bytes(client)[0]
         outcome = client.receive(reply(request, (60).to_bytes(4, "little"), int(status)))[0]
         assert (outcome.status, outcome.detail, outcome.reply) == (status, 60, None)
 

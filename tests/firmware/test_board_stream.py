@@ -29,12 +29,12 @@ from tests.models.usb import UsbLine
 LONG = board_link("air.frames_per_packet=40", "air.pilot_every=4")
 
 
-def played(device, link=LINK):
+def played_packets(device, link=LINK):
     found, idle = packets_shown(device.records().played().chips(), link)
     return [packet.tobytes() for packet in found], idle
 
 
-def expected(packets, link=LINK):
+def expected_packets(packets, link=LINK):
     return [packet_chips(p, link.codebook, link.packet.pilot_every).tobytes() for p in packets]
 
 
@@ -51,7 +51,7 @@ def test_packets_follow_without_a_gap(device, link, latency_s, ahead):
     length = link.packet.packet_chips
     at = len(chips) - 30 * length
     # the idle pattern until the first has come, then packet after packet
-    assert chips.chips()[at:].tobytes() == b"".join(expected(packets, link))
+    assert chips.chips()[at:].tobytes() == b"".join(expected_packets(packets, link))
     assert (chips.chips()[:at] == np.arange(at)[:, None] % 2).all()
     assert at % 2 == 0
     assert (stream.underruns, stream.sent) == (0, 30)
@@ -75,8 +75,8 @@ def test_an_empty_queue_is_named_and_shows_the_idle_pattern(device):
             stream.send(packet)
         stream.wait(0.01)
         assert not status_of(stream).faults
-    found, idle = played(device)
-    assert found == expected(packets)
+    found, idle = played_packets(device)
+    assert found == expected_packets(packets)
     assert idle > 2000
     assert stream.underruns == 1
     after = board.status()
@@ -102,8 +102,8 @@ def test_a_noisy_line_loses_and_doubles_nothing(device, seed):
     line.rates = (0.0, 0.0, 0.0)
     assert line.counts["dropped"]
     assert line.counts["doubled"]
-    found, _ = played(device, link)
-    assert found == expected(packets, link)
+    found, _ = played_packets(device, link)
+    assert found == expected_packets(packets, link)
 
 
 def test_the_watchdog_acts_on_a_stream_whose_host_is_gone(device, board):
@@ -253,7 +253,7 @@ def test_what_changes_is_right_at_its_first_chip(device, latency_s):
     starts = starts_of(chips, record.ticks, stream.sent, length)
     packets = [chips[n : n + length].tobytes() for n in np.searchsorted(record.ticks, starts)]
     for message, due in zip(made, due_us, strict=True):
-        (reported,) = expected(message, LINK)
+        (reported,) = expected_packets(message, LINK)
         begun_us = starts[packets.index(reported)] / (device.TICK_HZ / 1e6)
         # the board's answers come late by the line's latency, and with them what is known of its queue
         assert -8_000 <= due - begun_us <= 8_000 + 1e6 * latency_s
@@ -278,8 +278,8 @@ def test_a_stopped_stream_is_empty(device, board, how, at_once):
         board.start()
     device.run(300_000)
     assert board.status().state == State.DARK
-    found, _ = played(device)
-    assert found[:begun] == expected(sent)[:begun]
+    found, _ = played_packets(device)
+    assert found[:begun] == expected_packets(sent)[:begun]
     assert len(found) <= begun + 1
     with pytest.raises(VerifyError, match="the queue of a stream, which holds nothing to compare"):
         board.verify(some_bank())

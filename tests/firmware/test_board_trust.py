@@ -22,20 +22,20 @@ OTHER = bytes(range(2, 18))
 BANK = some_bank(2)
 
 
-def locked(device, key=KEY):
+def lock(device, key=KEY):
     board = board_on(device)
     board.set_key(key)
     return board
 
 
-def held(device):
+def held_state(device):
     """What a request that is refused leaves as it is."""
     status = board_on(device).status()
     return (status.state, status.level_ma, status.commits, status.watchdog)
 
 
 def test_a_locked_board_does_all_with_its_key_and_nothing_without(device):
-    board = locked(device)
+    board = lock(device)
     assert board.about.key_name == hashlib.sha256(KEY).digest()[:4]
     assert provision(board, BANK, Settings(level_ma=15)).swapped
     assert board.verify(BANK) == 0
@@ -43,7 +43,7 @@ def test_a_locked_board_does_all_with_its_key_and_nothing_without(device):
         stream.send(symbols_of(1, 1)[0])
     provision(board, BANK, Settings(start=False))
     board.start()
-    before = held(device)
+    before = held_state(device)
     assert before[1] == 15
     stranger = board_on(device)
     assert stranger.crc(0, 0, 100) >= 0
@@ -64,7 +64,7 @@ def test_a_locked_board_does_all_with_its_key_and_nothing_without(device):
         with pytest.raises(RefusedError, match="it has a key: give it with --key") as caught:
             refused()
         assert caught.value.status == Status.NEEDS_KEY
-    assert held(device) == before
+    assert held_state(device) == before
     with pytest.raises(RefusedError, match=r"has the key .*, this host's is"):
         board_on(device, key=OTHER)
     again = board_on(device, key=KEY)
@@ -76,7 +76,7 @@ def test_a_locked_board_does_all_with_its_key_and_nothing_without(device):
 @settings(max_examples=40, deadline=None)
 def test_seals_are_hmac_sha256_of_any_length(count, key):
     """The firmware's HMAC against hashlib's, over every length of a block."""
-    board = locked(SimulatedBoard(), key)
+    board = lock(SimulatedBoard(), key)
     count = min(count, board.session.max_payload - protocol.WriteRequest.fixed_bytes())
     data = bytes(n % 251 for n in range(count))
     written = board.session.call(protocol.WriteRequest(1, 7, data))
@@ -85,7 +85,7 @@ def test_seals_are_hmac_sha256_of_any_length(count, key):
 
 
 def test_any_bit_that_is_changed_is_found(device):
-    board = locked(device)
+    board = lock(device)
     line, client = SimulatedLine(device), board.session.client
     client.submit(protocol.LevelRequest(33))
     wire = client.poll(0.0)[0]
@@ -99,15 +99,15 @@ def test_any_bit_that_is_changed_is_found(device):
         if b[0] & protocol.REPLY_BIT:
             continue
         bad = Datagram(b[0], b[1], int.from_bytes(b[2:4], "little"), good.session, bytes(b[4:]))
-        answers |= set(replayed(line, bad.encode()))
+        answers |= set(replay_datagrams(line, bad.encode()))
         assert device.bench.level_ma == 20
     # a sequence of another number, a type of another length or none at all: never done
     assert answers <= {Status.BAD_SEAL, Status.NEEDS_KEY, Status.UNKNOWN_TYPE, Status.BAD_LENGTH}
-    assert replayed(line, wire) == [Status.OK]
+    assert replay_datagrams(line, wire) == [Status.OK]
     assert device.bench.level_ma == 33
 
 
-def replayed(line, wire):
+def replay_datagrams(line, wire):
     """Statuses of the answers to bytes that are played back, one datagram after the other."""
     found = []
     for part in wire.rstrip(b"\0").split(b"\0"):
@@ -130,28 +130,28 @@ def test_what_was_recorded_works_again_on_a_board_without_a_key_and_not_on_one_w
     plain = SimulatedBoard()
     wire = session_of(plain, None)
     plain.reset()
-    assert set(replayed(SimulatedLine(plain), wire)) >= {Status.OK}
+    assert set(replay_datagrams(SimulatedLine(plain), wire)) >= {Status.OK}
     assert plain.bench.level_ma == 15, "the attack that a key is against"
 
     device = SimulatedBoard()
-    board = locked(device)
+    board = lock(device)
     provision(board, BANK, Settings(start=False))
     board.save()
     wire = session_of(device, KEY)
     board_on(device, key=KEY).level(40)
     # in a later session, with the HELLO of the recorded one, and after a reset
     for _ in range(2):
-        before = held(device)
-        assert Status.BAD_SEAL in replayed(SimulatedLine(device), wire)
+        before = held_state(device)
+        assert Status.BAD_SEAL in replay_datagrams(SimulatedLine(device), wire)
         assert not device.shown().any()
-        assert held(device) == before
+        assert held_state(device) == before
         device.reset()
 
 
 @pytest.mark.parametrize("wraps", [False, True])
 def test_nor_is_anything_done_twice_in_a_session(device, wraps):
     """Not even when the numbers of its requests wrap."""
-    locked(device)
+    lock(device)
     line = recording(device)
     board = board_on(line, key=KEY)
     line.written = b""
@@ -165,12 +165,12 @@ def test_nor_is_anything_done_twice_in_a_session(device, wraps):
             client._tokens += 0x3FFF
             board.status()
         client._tokens = client._tokens // 65536 * 65536
-    assert replayed(SimulatedLine(device), first) == [Status.BAD_SEAL if wraps else Status.STALE]
+    assert replay_datagrams(SimulatedLine(device), first) == [Status.BAD_SEAL if wraps else Status.STALE]
     assert device.bench.level_ma == 44
 
 
 def test_who_has_no_key_does_not_stand_in_for_the_host(device):
-    board = locked(device)
+    board = lock(device)
     provision(board, BANK, Settings(watchdog=Watchdog.DARK, watchdog_ms=500))
     stranger = board_on(device)
     for _ in range(20):
@@ -189,7 +189,7 @@ def test_a_monitor_without_the_key_says_that_the_watchdog_acts(device):
 
     board_on(device).watchdog(Watchdog.DARK, 1000)
     assert kinds(None) == [StatusReply] * 2
-    locked(device)
+    lock(device)
     assert kinds(KEY) == [StatusReply] * 2
     assert kinds(None) == [KeyMissing, *[StatusReply] * 2]
     board_on(device, key=KEY).watchdog(Watchdog.KEEP, 0)
@@ -197,10 +197,10 @@ def test_a_monitor_without_the_key_says_that_the_watchdog_acts(device):
 
 
 def test_a_key_is_kept_and_changed(device):
-    board = locked(device)
+    board = lock(device)
     device.reset()
     assert not any(board_on(device).about.key_name), "not saved"
-    board = locked(device)
+    board = lock(device)
     provision(board, BANK, Settings(start=False))
     board.save()
     device.reset()

@@ -83,7 +83,7 @@ def every_request(board, bank, update):
     return answers
 
 
-def recorded(name):
+def read_record(name):
     lines = (VECTORS / name).read_text().splitlines()[1:]
     return [(e["dir"], bytes.fromhex(e["hex"])) for e in map(json.loads, lines)]
 
@@ -105,7 +105,7 @@ def test_the_host_of_2_0_and_this_firmware():
     """It is answered as by its own firmware, as far as an answer does not tell the time."""
     device = SimulatedBoard((7).to_bytes(12, "big"))
     expected, wire, seen = b"", b"", set()
-    for direction, data in recorded("host-2.0.jsonl"):
+    for direction, data in read_record("host-2.0.jsonl"):
         if direction == "rx":
             expected += data
             continue

@@ -15,8 +15,8 @@ from collections import Counter
 from pathlib import Path
 
 from tests.fuzz.corpus import kinds
-from tests.fuzz.mutate import damaged
-from tests.fuzz.test_readers import refused, store_of
+from tests.fuzz.mutate import damage
+from tests.fuzz.test_readers import is_refused, store_of
 
 MOST_S, MOST_MB = 20, 500
 
@@ -40,11 +40,11 @@ def main():
         end_s = time.monotonic() + 60 * args.minutes
         while time.monotonic() < end_s:
             kind = rng.choice(chosen)
-            data, began_s = damaged(kind.data, rng), time.monotonic()
+            data, began_s = damage(kind.data, rng), time.monotonic()
             read[kind.name] += 1
             try:
                 (folder / kind.name).mkdir(exist_ok=True)
-                bad[kind.name] += refused(kind, data, folder / kind.name)
+                bad[kind.name] += is_refused(kind, data, folder / kind.name)
                 assert time.monotonic() - began_s < MOST_S, "too long"
                 assert peak_mb() < MOST_MB, "too much memory"
             except Exception:

@@ -80,7 +80,7 @@ def _columns():
     return {"t": events.t_us, "x": events.x, "y": events.y, "p": events.p}
 
 
-def _written(path, write, *what):
+def write_file(path, write, *what):
     write(path, *what)
     return path.read_bytes()
 
@@ -91,10 +91,10 @@ def _db3(folder):
     _recording(folder, path.name)
     with path.open("rb") as file:
         messages = [message.data for _, _, message in make_reader(file).iter_messages()]
-    return _written(folder / "a.db3", write_sqlite, messages, range(len(messages)))
+    return write_file(folder / "a.db3", write_sqlite, messages, range(len(messages)))
 
 
-def _summarized(path):
+def summary_file(path):
     with Store(path) as store:
         summarize(store)
 
@@ -160,10 +160,10 @@ def kinds(folder, store):
         Kind("NPZ", "a.npz", _recording(folder, "a.npz"), read_recording),
         Kind("CSV", "a.csv", _recording(folder, "a.csv"), read_recording),
         Kind("CSV in gzip", "a.csv.gz", _recording(folder, "a.csv.gz"), read_recording),
-        Kind("NPY", "a.npy", _written(folder / "a.npy", write_npy, {"": table}), read_recording),
-        Kind("HDF5", "a.h5", _written(folder / "a.h5", write_hdf5, _columns()), read_recording),
-        Kind("MAT 7.3", "a.mat", _written(folder / "7.mat", write_mat_73, _columns()), read_recording),
-        Kind("MAT", "a.mat", _written(folder / "5.mat", write_mat, _columns()), read_recording),
+        Kind("NPY", "a.npy", write_file(folder / "a.npy", write_npy, {"": table}), read_recording),
+        Kind("HDF5", "a.h5", write_file(folder / "a.h5", write_hdf5, _columns()), read_recording),
+        Kind("MAT 7.3", "a.mat", write_file(folder / "7.mat", write_mat_73, _columns()), read_recording),
+        Kind("MAT", "a.mat", write_file(folder / "5.mat", write_mat, _columns()), read_recording),
         Kind("MCAP", "a.mcap", _recording(folder, "a.mcap"), read_recording),
         Kind("db3", "a.db3", _db3(folder), read_recording),
         Kind("NMEA", "a.nmea", NMEA, lambda path: read_nmea(path, datetime(2026, 11, 1, tzinfo=UTC), 3.0)),
@@ -177,7 +177,7 @@ def kinds(folder, store):
         Kind("link", "a.toml", (EXAMPLES / "link.toml").read_bytes(), load_link),
         Kind("scene", "a.toml", (EXAMPLES / "scenes" / "street.toml").read_bytes(), load_scene),
         Kind("campaign", "a.toml", (EXAMPLES / "campaigns" / "rates.toml").read_bytes(), plan_of),
-        Kind("results", "a.sqlite", store, _summarized),
+        Kind("results", "a.sqlite", store, summary_file),
         Kind("symbols", "a.json", json.dumps({"symbols": symbols}).encode(), lambda p: read_symbols(p, None)),
         Kind("masks", "a.npy", masks.read_bytes(), lambda p: read_masks(p, link)),
         Kind("inventory", "a.toml", INVENTORY, read_inventory),

@@ -22,7 +22,7 @@ ODD_BYTES = (
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 
-def damaged(data, rng):
+def damage(data, rng):
     """The bytes after one to four accidents."""
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         data = rng.choice(_ACCIDENTS)(data, rng)

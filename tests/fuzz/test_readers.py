@@ -18,7 +18,7 @@ from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.store import Store
 from tests.fuzz.corpus import kinds
-from tests.fuzz.mutate import damaged
+from tests.fuzz.mutate import damage
 from tests.unit.study.fake import fake_plan, run_fake
 
 NAMES = (
@@ -45,7 +45,7 @@ def corpus(tmp_path_factory):
     return {kind.name: kind for kind in kinds(folder, store_of(folder))}
 
 
-def refused(kind, data, folder):
+def is_refused(kind, data, folder):
     """Read a file with these bytes; whether it was refused, in lines that name it."""
     path = folder / kind.file
     path.write_bytes(data)
@@ -65,7 +65,7 @@ def refused(kind, data, folder):
 def test_the_corpus_is_good(corpus, tmp_path):
     assert tuple(corpus) == NAMES
     for kind in corpus.values():
-        assert not refused(kind, kind.data, tmp_path), kind.name
+        assert not is_refused(kind, kind.data, tmp_path), kind.name
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -73,7 +73,7 @@ def test_damaged_files(corpus, name, tmp_path):
     kind = corpus[name]
     rng = random.Random(zlib.crc32(name.encode()))
     rounds = ROUNDS.get(name, 40)
-    faults = sum(refused(kind, damaged(kind.data, rng), tmp_path) for _ in range(rounds))
+    faults = sum(is_refused(kind, damage(kind.data, rng), tmp_path) for _ in range(rounds))
     # Accidents that change nothing that matters are read, and others must be seen.
     assert faults > 0
 

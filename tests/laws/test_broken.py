@@ -45,32 +45,32 @@ class Changed:
         return (lambda *given: self.change(found(*given))) if name == self.method else found
 
 
-def compiled(inner):
+def change_compiled(inner):
     """What changes the function that an algorithm compiles to; `change(function) -> function`."""
     return lambda change: Changed(inner, "compile", change)
 
 
-separation = compiled(WhCorrelation())
-decoding = compiled(WhTransform())
-ranging = compiled(CentroidRanging())
-tracking = compiled(KalmanTracking())
+separation = change_compiled(WhCorrelation())
+decoding = change_compiled(WhTransform())
+ranging = change_compiled(CentroidRanging())
+tracking = change_compiled(KalmanTracking())
 
 
-def after(change):
+def change_result(change):
     """Tamper with the result."""
     return lambda function: lambda *given: change(function(*given))
 
 
-def changed(**fields):
+def change_fields(**fields):
     """Tamper with fields of the result."""
 
     def change(found):
         return replace(found, **{name: by(getattr(found, name)) for name, by in fields.items()})
 
-    return after(change)
+    return change_result(change)
 
 
-def before(act):
+def act_first(act):
     """Do something to the inputs first."""
 
     def tamper(function):
@@ -304,15 +304,15 @@ BROKEN = {
         ("round-trip", Forgetful(), "min_clusters=7"),
         ("picklable", ranging(lambda function: function), "pickle"),
         ("compiles", Refusing(), "got: a panel of 7 x 3 clusters only"),
-        ("inputs-kept", ranging(before(lambda view: view.sums.fill(0))), "inputs to stay as they were"),
-        ("read-only", ranging(before(lambda view: view.presence.pixels.sort())), "read-only"),
-        ("non-contiguous", ranging(before(lambda view: view.sums.data.cast("b"))), "contiguous"),
+        ("inputs-kept", ranging(act_first(lambda view: view.sums.fill(0))), "inputs to stay as they were"),
+        ("read-only", ranging(act_first(lambda view: view.presence.pixels.sort())), "read-only"),
+        ("non-contiguous", ranging(act_first(lambda view: view.sums.data.cast("b"))), "contiguous"),
         (
             "deterministic",
-            ranging(changed(distance_m=lambda d: d + np.random.random())),  # noqa: NPY002
+            ranging(change_fields(distance_m=lambda d: d + np.random.random())),  # noqa: NPY002
             "the same result when called again",
         ),
-        ("deterministic", ranging(before(lambda _: np.random.random())), "take a Generator"),  # noqa: NPY002
+        ("deterministic", ranging(act_first(lambda _: np.random.random())), "take a Generator"),  # noqa: NPY002
     ],
     "pilots": [
         ("shapes", Changed(WhPilots(), "codes", lambda codes: codes.astype(float)), "uint8"),
@@ -363,28 +363,40 @@ BROKEN = {
         ("no-lock-in-noise", sync(credulous), "no lock in noise"),
     ],
     "separation": [
-        ("shapes", separation(changed(probability=lambda p: p.astype(float))), "probability as float32"),
-        ("finds-clusters", separation(changed(selected=lambda s: np.roll(s, 1, 0))), "each cluster's pixels"),
-        ("sees-nothing", separation(after(without_events)), "no cell selected without events"),
+        (
+            "shapes",
+            separation(change_fields(probability=lambda p: p.astype(float))),
+            "probability as float32",
+        ),
+        (
+            "finds-clusters",
+            separation(change_fields(selected=lambda s: np.roll(s, 1, 0))),
+            "each cluster's pixels",
+        ),
+        ("sees-nothing", separation(change_result(without_events)), "no cell selected without events"),
         ("permutes", OneOrder(), "in another order"),
         ("results-owned", separation(one_buffer), "not to change the next"),
     ],
     "decoding": [
-        ("shapes", decoding(changed(llr=lambda x: x.astype(float))), "llr as float32"),
-        ("inverts", decoding(changed(symbols=lambda s: s ^ 1)), "profile raw8: symbol 0, got 1"),
-        ("llr-agrees", decoding(changed(llr=lambda x: -x)), "llr > 0 where a bit is 0"),
-        ("permutes", decoding(after(numbered)), "llr in the order"),
-        ("knows-nothing", decoding(changed(llr=lambda x: x + 5)), "llr of 0"),
-        ("clean-link", decoding(changed(symbols=lambda s: s ^ 1)), "no wrong symbol"),
+        ("shapes", decoding(change_fields(llr=lambda x: x.astype(float))), "llr as float32"),
+        ("inverts", decoding(change_fields(symbols=lambda s: s ^ 1)), "profile raw8: symbol 0, got 1"),
+        ("llr-agrees", decoding(change_fields(llr=lambda x: -x)), "llr > 0 where a bit is 0"),
+        ("permutes", decoding(change_result(numbered)), "llr in the order"),
+        ("knows-nothing", decoding(change_fields(llr=lambda x: x + 5)), "llr of 0"),
+        ("clean-link", decoding(change_fields(symbols=lambda s: s ^ 1)), "no wrong symbol"),
     ],
     "ranging": [
-        ("shapes", ranging(changed(pairs=lambda _: 0)), "pairs as a count"),
-        ("exact", ranging(changed(distance_m=lambda d: d * 1.01)), "exactly 4 px apart"),
-        ("monotone", ranging(changed(distance_m=lambda _: 50.0)), "distances that fall"),
+        ("shapes", ranging(change_fields(pairs=lambda _: 0)), "pairs as a count"),
+        ("exact", ranging(change_fields(distance_m=lambda d: d * 1.01)), "exactly 4 px apart"),
+        ("monotone", ranging(change_fields(distance_m=lambda _: 50.0)), "distances that fall"),
         ("moved", ranging(leaning), "wherever the bar stands"),
         ("focal-length", OneCamera(), "twice the distance"),
-        ("sees-nothing", ranging(changed(distance_m=np.nan_to_num)), "a distance of NaN from no cluster"),
-        ("clean-link", ranging(changed(distance_m=lambda d: d * 1.1)), "distance 54.01 m within 5%"),
+        (
+            "sees-nothing",
+            ranging(change_fields(distance_m=np.nan_to_num)),
+            "a distance of NaN from no cluster",
+        ),
+        ("clean-link", ranging(change_fields(distance_m=lambda d: d * 1.1)), "distance 54.01 m within 5%"),
     ],
     "tracking": [
         ("shapes", smoothing(early=True), "a prediction of None"),

@@ -105,7 +105,7 @@ def latency_with_readout_us(sensor, light_w_m2, side_px, *, seed=0):
     )
     first = np.flatnonzero(np.append(True, np.diff(one.pixel) > 0))
     words = np.sort(words_of(one.request_us[first], *np.divmod(one.pixel[first], side_px)))
-    return float(served(words, side_px, sensor.t_row_us)[0].t_us.mean() + 0.5)
+    return float(serve_requests(words, side_px, sensor.t_row_us)[0].t_us.mean() + 0.5)
 
 
 def words_of(t_us, row, column):
@@ -114,7 +114,7 @@ def words_of(t_us, row, column):
     return request_words(np.asarray(t_us, np.float64), code.astype(np.int32), 0.0)
 
 
-def served(words, height, row_us, *, until_us=np.inf, limit=(0, 200), memory=None, pending=None):
+def serve_requests(words, height, row_us, *, until_us=np.inf, limit=(0, 200), memory=None, pending=None):
     """What the readout makes of sorted requests: events, and `read_out`'s counts of others."""
     n = len(words)
     out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)

@@ -72,7 +72,7 @@ def serve_rom(rom, line, flash, stopped):
         flash.write_bytes(rom.flash)
 
 
-def flashed(flash):
+def flashed_part(flash):
     """The model of a part with this flash, by a crystal of 8 MHz or else of 12."""
     from tests.models.stm32 import Stm32
 
@@ -95,7 +95,7 @@ def serve_part(line, image, flash, leds, stopped):
                 return
             if importlib.util.find_spec("unicorn") is None:
                 raise ToolchainError("told to run; 'pip install unicorn' for the model that does")
-            chip = flashed(bytes(rom.flash))
+            chip = flashed_part(bytes(rom.flash))
         else:
             from tests.models.stm32 import Stm32
 

@@ -17,15 +17,15 @@ def scene_of_truth(truth):
     optics = {key: camera[key] for key in ("width", "height", "focal_mm", "pitch_um")}
     focal_px = CameraModel(**optics).focal_px
     table = {
-        **_taken(given, ("name", "duration_s", "t0_us", "seed", "flicker_lamps")),
+        **_take_keys(given, ("name", "duration_s", "t0_us", "seed", "flicker_lamps")),
         "camera": optics,
         # Its blur is stated as one sigma: a Gaussian without wings.
-        "lens": {**_taken(given, ("f_number", "focus_m", "halo"), ("bloom", "bloom_px")), "wings": False},
+        "lens": {**_take_keys(given, ("f_number", "focus_m", "halo"), ("bloom", "bloom_px")), "wings": False},
         "motion": _motion_of(given, focal_px),
         "background": {
             "light_w_m2": given["background_w_m2"],
             "texture": given["background_texture"],
-            **_taken(given, (), ("texture_px",)),
+            **_take_keys(given, (), ("texture_px",)),
             # How far around the bar such recordings have events of a background that moves.
             **({"around_px": 24, "texture_step_px": 0.4} if given.get("bg_moves") else {}),
             **({"around_px": 60, "change_s": given["bg_steps"]} if given.get("bg_steps") else {}),
@@ -42,7 +42,7 @@ def scene_of_truth(truth):
             for x, y, right, down, radius, bend in given.get("drops", ())
         ],
         "sensor": {
-            **_taken(given, OF_SENSOR),
+            **_take_keys(given, OF_SENSOR),
             "hot_share": given["hot_pixels"] / (camera["width"] * camera["height"]),
         },
         "bars": [_bar_spec_of(*both, given) for both in zip(truth["bars"], sent, strict=True)],
@@ -53,14 +53,14 @@ def scene_of_truth(truth):
     return resolve_scene(table, source="truth")
 
 
-def _taken(given, keys, optional=()):
+def _take_keys(given, keys, optional=()):
     """Values under keys that a scene has, too; the optional ones where they are."""
     return {key: given[key] for key in (*keys, *(key for key in optional if key in given))}
 
 
 def _bar_spec_of(bar, sent, given):
     """A bar's table of a scene, from its row of the truth and what that means."""
-    found = _taken(
+    found = _take_keys(
         bar,
         ("x_m", "y_m", "z_m", "width_m", "ppm", "led_w_m2", "start_chip"),
         ("chips_file", "lean_deg", "tilt_deg", "covered", "cover_s", "pole_s", "dead_leds", "led_spread"),
@@ -75,7 +75,7 @@ def _bar_spec_of(bar, sent, given):
 
 def _motion_of(given, focal_px):
     """What a scene's table says of the camera's motion, as keys of `[motion]`."""
-    found = _taken(given, ("distance_m", "speed_mps", "vib_rate_rad_s"), ("lateral_mps",))
+    found = _take_keys(given, ("distance_m", "speed_mps", "vib_rate_rad_s"), ("lateral_mps",))
     names = {
         "cam_yaw_deg": "yaw_deg",
         "cam_pitch_deg": "pitch_deg",

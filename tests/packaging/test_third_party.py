@@ -87,7 +87,7 @@ class Environment:
         return {(r["role"], r["id"]): (r["distribution"], r["version"]) for r in rows}
 
 
-def released(folder):
+def build_wheel(folder):
     """The SDK's wheel; that from its sdist is the same."""
     folder.mkdir()
     release = runpy.run_path(str(ROOT / ".ci" / "release.py"))
@@ -104,7 +104,7 @@ def released(folder):
 def environment(tmp_path):
     """The environment with both wheels."""
     made = Environment(tmp_path)
-    made.pip("install", released(tmp_path / "dist"), made.build(EXAMPLE), made.build(FORMATS))
+    made.pip("install", build_wheel(tmp_path / "dist"), made.build(EXAMPLE), made.build(FORMATS))
     made.lend_kernels()
     yield made
     # Borrowed packages are links: only these go.

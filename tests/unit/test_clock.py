@@ -93,7 +93,7 @@ def rows(events: Events) -> list[Row]:
     return list(zip(*(c.tolist() for c in (events.t_us, events.x, events.y, events.p)), strict=True))
 
 
-def taken(events: Events, cuts: list[int]) -> tuple[list[Row], CameraClock]:
+def take_in_pieces(events: Events, cuts: list[int]) -> tuple[list[Row], CameraClock]:
     clock = CameraClock(WIDTH, HEIGHT)
     pieces = [e for a, b in pairwise([0, *cuts, len(events)]) for e in clock.take(events[a:b])]
     clock.close()
@@ -105,7 +105,7 @@ def taken(events: Events, cuts: list[int]) -> tuple[list[Row], CameraClock]:
 def test_any_split_is_assessed_event_by_event(seed: int, cuts: list[int]) -> None:
     events = leaping(seed)
     want, counts, firsts = twin_clock(rows(events))
-    got, clock = taken(events, sorted(min(cut, len(events)) for cut in cuts))
+    got, clock = take_in_pieces(events, sorted(min(cut, len(events)) for cut in cuts))
     assert got == want
     assert {name: clock.counts[expected] for name, expected in NAMES.items()} == counts
     assert clock.firsts == {NAMES[name]: first for name, first in firsts.items()}
@@ -123,7 +123,7 @@ def even(start_us: int, n: int = 2000, step_us: int = 50) -> Events:
 def test_a_clock_that_others_agree_on_is_believed_and_nothing_is_lost(leap_us: int) -> None:
     one = even(10**12)
     other = even(int(one.t_us[-1]) + leap_us)
-    got, clock = taken(Events.concat([one, other]), [100, 2100])
+    got, clock = take_in_pieces(Events.concat([one, other]), [100, 2100])
     assert len(got) == len(one) + len(other)
     assert clock.counts["clock_restarts" if leap_us < 0 else "clock_leaps"] == 1
     assert [clock.camera_us(float(row[0])) for row in got] == [*one.t_us, *other.t_us]

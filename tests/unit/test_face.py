@@ -67,7 +67,7 @@ def test_what_type_checkers_see_is_what_is_found() -> None:
         assert name == other
 
 
-def imported(code: str) -> set[str]:
+def imported_modules(code: str) -> set[str]:
     """All modules that a fresh interpreter has after a statement."""
     command = [sys.executable, "-c", f"import sys\n{code}\nprint(*sys.modules)"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
@@ -75,7 +75,7 @@ def imported(code: str) -> set[str]:
 
 
 def test_importing_the_package_imports_nothing_else() -> None:
-    more = imported("import evlcp_sdk as evlcp; dir(evlcp)") - imported("")
+    more = imported_modules("import evlcp_sdk as evlcp; dir(evlcp)") - imported_modules("")
     assert more == {"evlcp_sdk"}
 
 
@@ -103,7 +103,7 @@ LIGHT = "numba scipy evlcp_sdk.rx evlcp_sdk.sim matplotlib"
     ],
 )
 def test_what_is_light_imports_nothing_heavy(code: str, heavy: str) -> None:
-    assert not {*heavy.split()} & imported(code)
+    assert not {*heavy.split()} & imported_modules(code)
 
 
 def test_what_is_refused() -> None:

@@ -309,7 +309,7 @@ def misfit(suspects: dict[str, int], fits_mm: float | None = None) -> dict[str, 
 NO_SITE = {"refused": {"no-site": 4}, "heard": {"0": 9, "1": 7, "2": 9}}
 
 
-def known(strange: list[int], unseen: list[int]) -> dict[str, Any]:
+def positions_beside(strange: list[int], unseen: list[int]) -> dict[str, Any]:
     """Positions of a bar with the id 7, beside others that are in no site, and sites that are not seen."""
     reported = {str(number): one for number, one in enumerate([7, *strange])}
     return {"fixes": 9, "bars": {"0": 7}, "heard": reported, "sites_unseen": unseen}
@@ -321,10 +321,18 @@ def known(strange: list[int], unseen: list[int]) -> dict[str, Any]:
         ("no-site", NO_SITE, "received: ids 7, 9: compare"),
         # A bar more beside those that are known is none.
         ("no-site", NO_SITE | {"fixes": 9}, ""),
-        ("unknown-id", known([107], [8]), "without id 107, received and in no site; id 8 of the sites"),
-        ("unknown-id", known([9, 4], [1, 2]), "without ids 4, 9, received and in no site; ids 1, 2 of the"),
-        ("unknown-id", known([107], []), ""),
-        ("unknown-id", known([], [8]), ""),
+        (
+            "unknown-id",
+            positions_beside([107], [8]),
+            "without id 107, received and in no site; id 8 of the sites",
+        ),
+        (
+            "unknown-id",
+            positions_beside([9, 4], [1, 2]),
+            "without ids 4, 9, received and in no site; ids 1, 2 of the",
+        ),
+        ("unknown-id", positions_beside([107], []), ""),
+        ("unknown-id", positions_beside([], [8]), ""),
         ("misfit", misfit({"heading": 9, "bar 1": 2}), "another heading would explain it: compare"),
         ("misfit", misfit({"focal length": 10, "bar 0": 6}, 34.6), "another focal length or another bar 0"),
         (

@@ -31,7 +31,7 @@ from evlcp_sdk.values import Events
 LINK = load_link()
 
 
-def rendered(link=(), duration_s=0.12, seed=3, **changes: Any) -> SimulatedSource:
+def render(link=(), duration_s=0.12, seed=3, **changes: Any) -> SimulatedSource:
     light = {"background.light_w_m2": 0.01, "bars.0.led_w_m2": 8.0}
     keys = {"duration_s": duration_s, **light, **changes}
     scene = load_scene("night", keys, link=load_link(overrides=link))
@@ -64,7 +64,7 @@ def code_of(diagnosis: Diagnosis) -> str:
     ],
 )
 def test_what_is_wrong_is_named(code: str, changes: dict[str, Any], sent: tuple[str, ...], step: str) -> None:
-    with rendered(sent, **changes) as source:
+    with render(sent, **changes) as source:
         diagnosis = diagnose(source, LINK)
     assert code_of(diagnosis) == code
     wrong = [one for one in diagnosis.checks if one.verdict in ("fail", "doubt")]
@@ -97,7 +97,7 @@ WH8, REED_SOLOMON = ("modulation.id=wh8",), ("error-correction.id=reed-solomon",
     ],
 )
 def test_what_receive_warns_of(warned, sent, read, duration_s, changes, step) -> None:
-    summary = receive_to_folder(rendered(sent, duration_s, **changes), None, load_link(overrides=read))
+    summary = receive_to_folder(render(sent, duration_s, **changes), None, load_link(overrides=read))
     assert {one["code"] for one in summary["warnings"]} == warned
     assert not warned or any(step in one["next_step"] for one in summary["warnings"])
 
@@ -106,7 +106,7 @@ def test_parts_of_a_near_bar_are_no_frames_of_another() -> None:
     """Pieces of a bar of 480 rows are followed before the whole of it is known."""
     near = {"motion.distance_m": 15.0, "motion.speed_mps": 0.0, "motion.vib_rate_rad_s": 0.0}
     day = {"background.light_w_m2": 1.0, "bars.0.led_w_m2": None, "sensor.hold": True, "sensor.refr_us": 20.0}
-    summary = receive_to_folder(rendered((), 0.045, **near, **day, **{"bars.0.x_m": -0.9}), None)
+    summary = receive_to_folder(render((), 0.045, **near, **day, **{"bars.0.x_m": -0.9}), None)
     counts = summary["counts"]
     assert counts["frames"] == 13
     assert (counts["frames_rejected"], counts["frames_of_parts"] >= 10) == (0, True)
@@ -123,7 +123,7 @@ def test_a_restart_is_reported_in_words() -> None:
     assert 70 <= float(rest.split()[0]) < 77
 
 
-def judged(*sources: LightSource, quality=1.0, frames=0, rejected=0, duration_us=200000.0) -> str:
+def first_failure(*sources: LightSource, quality=1.0, frames=0, rejected=0, duration_us=200000.0) -> str:
     """What is wrong first of all with light that the survey told, and what the receiver made of it."""
     tally = RunTally(LINK.packet)
     if frames:
@@ -180,7 +180,7 @@ SLOW = replace(BAR, kind="lamp", rate_hz=2360.0, strength=0.6, typical_us=814.0,
     ],
 )
 def test_what_light_and_receiver_say_together(code: str, source: LightSource, read: dict[str, Any]) -> None:
-    assert judged(source, **read) == code
+    assert first_failure(source, **read) == code
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_what_light_and_receiver_say_together(code: str, source: LightSource, re
     ],
 )
 def test_a_bar_that_is_not_read_beside_one_that_is(code: str, changes: dict[str, Any]) -> None:
-    assert judged(BAR, replace(BAR, **{"box_px": (900, 300, 920, 450)} | changes), frames=40) == code
+    assert first_failure(BAR, replace(BAR, **{"box_px": (900, 300, 920, 450)} | changes), frames=40) == code
 
 
 LAMP = (
@@ -208,12 +208,12 @@ LAMP = (
 def test_a_framing_without_a_preamble_is_assessed_by_its_frames(dark: bool) -> None:
     scene, link = {"motion.distance_m": 30.0}, load_link(overrides=LAMP)
     scene |= {"bars.0.led_w_m2": 0.0} if dark else {}
-    with rendered(LAMP, 0.08, **scene) as source:
+    with render(LAMP, 0.08, **scene) as source:
         diagnosis = diagnose(source, link)
     verdicts = {one.stage: one.verdict for one in diagnosis.checks}
     assert (code_of(diagnosis), verdicts["preamble"]) == ("dark" if dark else "", "skip")
     assert (diagnosis.counts["frames"] <= 10, any(one.fits for one in diagnosis.trials)) == (dark, False)
-    with rendered(LAMP, 0.08, **scene) as source:
+    with render(LAMP, 0.08, **scene) as source:
         trial = infer_link(source, link)[0]
     assert (trial.changes, trial.frames <= 10, trial.fits) == ((), dark, not dark)
 
@@ -268,18 +268,18 @@ def test_rare_rises_of_a_dim_code_are_no_lamps() -> None:
 
 
 def test_links_are_inferred_and_ranked() -> None:
-    with rendered(("modulation.id=wh8", "air.pilot_every=2", "air.chip_rate_hz=8000"), 0.2) as source:
+    with render(("modulation.id=wh8", "air.pilot_every=2", "air.chip_rate_hz=8000"), 0.2) as source:
         best, *rest = infer_link(source, LINK)
     assert dict(best.changes) == {"air.chip_rate_hz": 8000, "modulation.id": "wh8", "air.pilot_every": 2}
     assert best.fits
     assert all(best.rank >= other.rank for other in rest)
-    with rendered() as source:
+    with render() as source:
         assert infer_link(source, LINK)[0].changes == ()
 
 
-def written(folder: Path, link: tuple[str, ...] = (), *, turned: bool = False) -> Path:
+def write_recording(folder: Path, link: tuple[str, ...] = (), *, turned: bool = False) -> Path:
     """A recording, on request upside down."""
-    with rendered(link) as source:
+    with render(link) as source:
         events, _ = source.read()
     if turned:
         events = Events(events.t_us, 1279 - events.x, 719 - events.y, events.p)
@@ -294,7 +294,7 @@ def run(*args: Any) -> Result:
 
 
 def test_picture_upside_down_is_noticed(tmp_path: Path) -> None:
-    diagnosis = diagnose(written(tmp_path, turned=True), LINK)
+    diagnosis = diagnose(write_recording(tmp_path, turned=True), LINK)
     assert code_of(diagnosis) == "turned"
     assert diagnosis.counts["frames_rejected"] == 0
 
@@ -315,7 +315,7 @@ def test_a_recording_without_events_fails_once(tmp_path: Path) -> None:
 
 
 def test_command_says_it_in_words_as_json_and_on_a_page(tmp_path: Path) -> None:
-    recording, page = written(tmp_path, ("air.chip_rate_hz=8000",)), tmp_path / "slow.html"
+    recording, page = write_recording(tmp_path, ("air.chip_rate_hz=8000",)), tmp_path / "slow.html"
     shown = run("diagnose", recording, "-o", page).stdout
     assert "blinks at 8 kHz, the link says 10 kHz" in shown
     assert "next: --set air.chip_rate_hz=8000" in shown
@@ -332,14 +332,14 @@ def test_command_says_it_in_words_as_json_and_on_a_page(tmp_path: Path) -> None:
 
 def test_receive_takes_the_link_that_fits(tmp_path: Path) -> None:
     reported = run(
-        "receive", written(tmp_path, ("modulation.id=wh8",)), "-o", tmp_path / "out", "--link", "auto"
+        "receive", write_recording(tmp_path, ("modulation.id=wh8",)), "-o", tmp_path / "out", "--link", "auto"
     )
     assert "link --set modulation.id=wh8" in reported.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["codebook"]["profile"] == "wh8"
 
 
-def counted_twin(events: Events, shape: tuple[int, int], shift: int, calm_us: int) -> tuple[Any, Any, Any]:
+def count_twin(events: Events, shape: tuple[int, int], shift: int, calm_us: int) -> tuple[Any, Any, Any]:
     """The counts of the kernel, pixel by pixel."""
     cells = ((shape[0] - 1 >> shift) + 1, (shape[1] - 1 >> shift) + 1)
     kinds = (_kernels.BINS, np.uint32), (_kernels.SHORT, np.uint32), (2, np.int64)
@@ -368,7 +368,7 @@ def test_kernel_counts_as_its_twin_does() -> None:
     shape = (12, 20)
     x, y, p = (rng.integers(0, most, 4000) for most in (20, 12, 2))
     events = Events.of(np.cumsum(rng.integers(0, 9, 4000)), x, y, p)
-    expected = counted_twin(events, shape, 3, 400)
+    expected = count_twin(events, shape, 3, 400)
     long_ago = np.iinfo(np.int64).min // 2
     given = [np.full(shape, long_ago), np.ones(shape, np.uint8), np.full(shape, long_ago)]
     counts = [np.zeros_like(one) for one in expected]

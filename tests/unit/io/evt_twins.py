@@ -32,7 +32,7 @@ class Decoded:
             self.add(self.events, (t, x, y, p), at)
 
 
-def judged(words, k, bits, low_bits, before):
+def judge_time_high(words, k, bits, low_bits, before):
     """Whether TIME_HIGH words[k] is believed after `before`, `early` by little, or not believed."""
     ring, size = 1 << bits, (bits + 4) // 8
     ahead = (words[k] - before) % ring
@@ -48,7 +48,7 @@ def judged(words, k, bits, low_bits, before):
 
 def doubtful(out, words, k, bits, low_bits, before, at):
     """Count what TIME_HIGH words[k] is after `before`; whether it is not believed."""
-    verdict, value = judged(words, k, bits, low_bits, before), words[k] % (1 << bits)
+    verdict, value = judge_time_high(words, k, bits, low_bits, before), words[k] % (1 << bits)
     if verdict != "believed":
         out.lose("time_glitches", at)
     out.rollovers += verdict == "believed" and value < before

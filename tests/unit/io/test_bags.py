@@ -11,7 +11,7 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import open_source, open_writer, read_events, write_events
 from evlcp_sdk.values import Events, Triggers
 from tests.conftest import ROOT
-from tests.unit.io.writers import packed, packed_ros1, write_mcap, write_ros1, write_sqlite
+from tests.unit.io.writers import pack_ros1, pack_ros2, write_mcap, write_ros1, write_sqlite
 
 BAGS = Path(__file__).parents[3].parent / "shared" / "recordings" / "bags"
 RECORDING = ROOT / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
@@ -61,7 +61,7 @@ def same_as_the_recording(path):
 def test_files_of_a_folder_are_read_in_their_order(listed, packets, tmp_path):
     """Twelve: by their names, 10 would come before 2."""
     for n in range(12):
-        messages = list(map(packed, packets[n * 6 : n * 6 + 6]))
+        messages = list(map(pack_ros2, packets[n * 6 : n * 6 + 6]))
         write_sqlite(tmp_path / f"name_{n}.db3", messages, range(6))
     paths = "".join(f"    - name_{n}.db3\n" for n in range(12)) if listed else ""
     head = "rosbag2_bagfile_information:\n  version: 5\n  relative_file_paths:\n" if listed else ""
@@ -75,7 +75,7 @@ def test_files_of_a_folder_are_read_in_their_order(listed, packets, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("write", "pack"), [(write_sqlite, packed), (write_mcap, packed), (write_ros1, packed_ros1)]
+    ("write", "pack"), [(write_sqlite, pack_ros2), (write_mcap, pack_ros2), (write_ros1, pack_ros1)]
 )
 @pytest.mark.parametrize("how", ["one is 0", "jitter", "go round"])
 def test_packets_are_in_order_whatever_their_log_times(how, write, pack, packets, tmp_path):
@@ -94,12 +94,12 @@ def test_packets_are_in_order_whatever_their_log_times(how, write, pack, packets
 @pytest.mark.parametrize("how", ["one after the other", "a hundred later"])
 def test_packets_that_are_there_twice_are_left_out(how, packets, tmp_path):
     both = [m for one in packets for m in (one, one)] if how.startswith("one") else packets * 2
-    source = same_as_the_recording(write_sqlite(tmp_path / "a.db3", list(map(packed, both)), range(999)))
+    source = same_as_the_recording(write_sqlite(tmp_path / "a.db3", list(map(pack_ros2, both)), range(999)))
     assert source.counts["packets_twice"] == len(packets)
 
 
 def test_packets_that_are_missing_are_counted(packets, tmp_path):
-    there = [packed(packet) for packet in packets if packet[0] not in (20, 21, 40)]
+    there = [pack_ros2(packet) for packet in packets if packet[0] not in (20, 21, 40)]
     with open_source(write_sqlite(tmp_path / "a.db3", there, range(99))) as source:
         source.read()
     lost = source.losses["packets_lost"]
@@ -110,12 +110,12 @@ def test_packets_that_are_missing_are_counted(packets, tmp_path):
 def test_a_driver_that_begins_anew(packets, tmp_path):
     """Numbers from 0 again, other words: what came before is given first, and nothing is missing."""
     again = [(n - 40, words) for n, words in packets[40:]]
-    messages = [packed(one, order=">") for one in packets[:40] + again]
+    messages = [pack_ros2(one, order=">") for one in packets[:40] + again]
     same_as_the_recording(write_sqlite(tmp_path / "a.db3", messages, range(999)))
 
 
 def test_what_is_wrong_with_a_bag_is_reported(tmp_path):
-    message = packed((0, np.array([0x8001, 0x6000, 0x0005, 0x2007], "<u2").tobytes()))
+    message = pack_ros2((0, np.array([0x8001, 0x6000, 0x0005, 0x2007], "<u2").tobytes()))
     write_sqlite(tmp_path / "two.db3", [message], [0], topics=2)
     write_sqlite(tmp_path / "none.db3", [], [], topics=0)
     write_sqlite(tmp_path / "cut.db3", [message[:-3]], [0])

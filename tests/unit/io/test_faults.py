@@ -131,11 +131,11 @@ def test_a_pipe_gives_what_is_there(bytes_at_a_time):
     good = np.array(GOOD * 60_000, "<u2")
     # Bytes that are missing make the reader look ahead.
     data = HEADER + good[:200_000].tobytes() + good[200_000:].tobytes()[101:]
-    with RawSource("whole", file=_piped(data, len(data))) as source:
+    with RawSource("whole", file=_pipe(data, len(data))) as source:
         whole, _ = source.read()
         losses = source.losses
     seen = threading.Event()
-    with RawSource("pieces", file=_piped(data, bytes_at_a_time, seen)) as source:
+    with RawSource("pieces", file=_pipe(data, bytes_at_a_time, seen)) as source:
         pieces = []
         for events in source.chunks():
             pieces.append(events)
@@ -147,7 +147,7 @@ def test_a_pipe_gives_what_is_there(bytes_at_a_time):
     assert source.losses == losses
 
 
-def _piped(data, at_a_time, seen=None):
+def _pipe(data, at_a_time, seen=None):
     """The end of a pipe into which a thread writes; behind the middle only when the first half is `seen`."""
     end, start = os.pipe()
 

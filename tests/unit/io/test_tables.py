@@ -216,7 +216,7 @@ def stretch(first_us):
     return Events.of(t, np.arange(400), np.arange(400), np.arange(400) & 1)
 
 
-def saved(path, events):
+def save_table(path, events):
     """A table of events in any order, past the writers, which refuse some."""
     if path.suffix == ".npz":
         np.savez(path, t_us=events.t_us, x=events.x, y=events.y, p=events.p, width=640, height=480)
@@ -232,7 +232,7 @@ def test_a_clock_may_leap_and_a_time_be_wrong(name, size, tmp_path):
     good = stretch(5_000_000)
     parts = [good[:200], Events.of([10**15], [5], [5], [1]), good[200:]]
     parts += [stretch(0), stretch(90_000_000_000), stretch(10_000_000)]
-    path = saved(tmp_path / name, Events.concat(parts))
+    path = save_table(tmp_path / name, Events.concat(parts))
     with open_source(path) as source:
         got = Events.concat(source.chunks(size))
     del parts[1]

@@ -61,7 +61,7 @@ DEFINITION = (
 )
 
 
-def packed(packet, order="<"):
+def pack_ros2(packet, order="<"):
     """A message of ROS 2, by hand: every field at a multiple of its size."""
     seq, words = packet
     head = struct.pack(f"{order}iII4sIIQQ", 1, 2, 4, b"cam\0", 720, 1280, seq, 0)
@@ -69,7 +69,7 @@ def packed(packet, order="<"):
     return (b"\0\1\0\0" if order == "<" else b"\0\0\0\0") + head + tail + words
 
 
-def packed_ros1(packet):
+def pack_ros1(packet):
     """A message of ROS 1: nothing stands between fields, and the header has a number of its own."""
     seq, words = packet
     head = struct.pack("<IIII3sIIQQ", 0, 1, 2, 3, b"cam", 720, 1280, seq, 0)

@@ -21,7 +21,7 @@ PATIENT = Budget(waiting_ms=1e6, most_ms=1e7)
 """Nothing is left out, however slow the machine is."""
 
 
-def until(true: Callable[[], bool]) -> None:
+def wait_until(true: Callable[[], bool]) -> None:
     """Wait for something, as long as a machine may take that does much else."""
     end = time.monotonic() + 60
     while not true():

@@ -33,7 +33,7 @@ from tests.unit.live.helpers import PATIENT, dies, key, sender
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
 
 
-def gathered(subscription: Subscription) -> dict[str, list[Any]]:
+def gather(subscription: Subscription) -> dict[str, list[Any]]:
     found: dict[str, list[Any]] = {}
     for news in subscription.take():
         found.setdefault(news.kind, []).append(news.value)
@@ -47,7 +47,7 @@ def test_a_replay_gives_what_the_file_gives(demo_raw, tmp_path, capsys) -> None:
     mine = publisher.subscribe(most=100_000)
     given: dict[str, Any] = {"publisher": publisher, "budget": PATIENT, "warm": False}
     summary = live(f"replay:{demo_raw}?speed=50", tmp_path / "out", **given)
-    found = gathered(mine)
+    found = gather(mine)
     packets = list(receive(demo_raw))
     assert [key(f) for f in found["frame"]] == [key(f) for packet in packets for f in packet.frames]
     assert [key(p.frames[0]) for p in found["packet"]] == [key(p.frames[0]) for p in packets]
@@ -77,7 +77,7 @@ def test_frames_of_several_links_name_theirs(demo_raw: Path) -> None:
     publisher = Publisher()
     mine = publisher.subscribe({"frame", "packet"}, most=100_000)
     live(f"replay:{demo_raw}?speed=50", None, links, publisher=publisher, budget=PATIENT, warm=False)
-    found = gathered(mine)
+    found = gather(mine)
     packets = list(receive(demo_raw, links))
     assert [key(f) for f in found["frame"]] == [key(f) for packet in packets for f in packet.frames]
     assert {frame.link for frame in found["frame"]} == {packet.link for packet in packets} == {"link-0"}
@@ -155,7 +155,7 @@ def test_what_there_is_no_time_for_is_left_out_and_counted(demo_raw: Path) -> No
     )
     with RawSource(demo_raw) as source:
         total = len(source.read()[0])
-    assert sum(len(events) for events in gathered(mine)["events"]) == total
+    assert sum(len(events) for events in gather(mine)["events"]) == total
     shed = summary["live"]["shed"]
     assert shed["too_late"] > 0
     left_out = sum(n for name, n in shed.items() if name != "frames_not_ranged")
@@ -174,7 +174,7 @@ def test_slices_that_wait_are_taken_together_and_nothing_is_left_out(demo_raw: P
     live(Burst(demo_raw), publisher=publisher, budget=PATIENT, warm=False)
     # A slice has 2000 events.
     assert max(taken) > 4000
-    assert [key(f) for f in gathered(mine)["frame"]] == [key(f) for p in receive(demo_raw) for f in p.frames]
+    assert [key(f) for f in gather(mine)["frame"]] == [key(f) for p in receive(demo_raw) for f in p.frames]
 
 
 def test_distances_are_measured_of_every_nth_frame(demo_raw: Path) -> None:
@@ -215,7 +215,7 @@ def test_a_damaged_recording_is_not_waited_for(demo_raw: Path, tmp_path: Path) -
     waited_us = t_us[-1] - t_us[0] - summary["recording"]["counts"]["silences_skipped_us"]
     assert 0 < waited_us < 10e6
     assert "pace" in [note["code"] for note in summary["notes"]]
-    assert [key(f) for f in gathered(mine)["frame"]] == [key(f) for p in receive(damaged) for f in p.frames]
+    assert [key(f) for f in gather(mine)["frame"]] == [key(f) for p in receive(damaged) for f in p.frames]
 
 
 def test_who_sends_may_die_at_any_moment(demo_raw: Path, tmp_path: Path, evlcp: Callable[..., Any]) -> None:

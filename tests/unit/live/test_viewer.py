@@ -32,7 +32,7 @@ from evlcp_sdk.run import live
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Events, Fix, ReceivedMessage, Triggers
 from tests.conftest import rows_of
-from tests.unit.live.helpers import LINKS, PATIENT, sender, until
+from tests.unit.live.helpers import LINKS, PATIENT, sender, wait_until
 from tests.unit.report.test_pages import HOSTILE
 from tests.unit.results.test_positions import SITE, packets
 from tests.unit.study.browser import CHROMIUM, Browser
@@ -72,7 +72,7 @@ class Stage:
 
 
 @contextmanager
-def staged(**given: Any) -> Iterator[Stage]:
+def run_viewer(**given: Any) -> Iterator[Stage]:
     publisher = Publisher()
     with serve(Serving(view=True, **given), publisher, LINKS, name="a name", sites=(SITE,)) as services:
         yield Stage(publisher, services["view"])  # type: ignore[arg-type]
@@ -81,7 +81,7 @@ def staged(**given: Any) -> Iterator[Stage]:
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    with staged() as one:
+    with run_viewer() as one:
         yield one
 
 
@@ -143,7 +143,7 @@ def test_a_credit_a_bundle(stage: Stage) -> None:
         assert (head["picture"], picture) == (None, b"")
         link.send('{"next": true}')
         # One is drawn once it is asked for.
-        until(lambda: stage.publisher.pictures._asked)
+        wait_until(lambda: stage.publisher.pictures._asked)
         stage.picture(20_000)
         head, picture = bundle_of(link)
         assert (head["news"], head["picture"]["t_us"]) == ([], 20_000)
@@ -230,19 +230,19 @@ def test_browsers_only_look_on(stage: Stage) -> None:
 
 def test_a_recording_is_what_came(tmp_path: Path) -> None:
     folder = tmp_path / "not" / "made"
-    with staged(record_to=folder) as stage, stage.connect() as link:
+    with run_viewer(record_to=folder) as stage, stage.connect() as link:
         publisher = stage.publisher
         link.recv(30)
         publish(publisher, 1_000)
         link.send('{"record": true}')
-        until(lambda: publisher.wanted("events"))
+        wait_until(lambda: publisher.wanted("events"))
         publish(publisher, 2_000)
         publisher.publish("triggers", 2_500, Triggers.of([2_500, 3_004], [0, 0], [1, 0]))
         publish(publisher, 3_000)
         link.send('{"record": false}')
-        until(lambda: not publisher.wanted("events"))
+        wait_until(lambda: not publisher.wanted("events"))
         publish(publisher, 4_000)
-        until(lambda: any(folder.glob("live-*.raw")))
+        wait_until(lambda: any(folder.glob("live-*.raw")))
         stage.frame(0)
         assert next_of(link)[0]["record"]["events"] == 20
         (path,) = folder.iterdir()
@@ -258,11 +258,11 @@ def test_what_was_recorded_stays_where_a_recording_has_to_end(why, tmp_path, mon
     recorder = Recorder(publisher, tmp_path, 1280, 720)
     recorder.start()
     publish(publisher, 2_000)
-    until(lambda: recorder.state["events"] == 10)
+    wait_until(lambda: recorder.state["events"] == 10)
     if why == "disk":
         monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=7_000_000))
     publish(publisher, 3_000 if why == "disk" else 1_000)
-    until(lambda: not recorder.state["recording"])
+    wait_until(lambda: not recorder.state["recording"])
     reported = {"disk": "7 MB are left on the disk: expected 100", "clock": "event at 1000 us after 2009 us"}
     assert reported[why] in recorder.state["fault"]
     with open_source(tmp_path / recorder.state["file"]) as source:
@@ -276,7 +276,7 @@ def publish(publisher: Publisher, t_us: int) -> None:
 
 def test_who_has_asked_nothing_yet_is_left_at_the_end() -> None:
     """Browsers open connections that they may need."""
-    with staged() as stage:
+    with run_viewer() as stage:
         idle = socket.create_connection(("127.0.0.1", stage.view.port))
         assert stage.ask("/")[0] == 403
     with idle, suppress(ConnectionResetError):
@@ -286,7 +286,7 @@ def test_who_has_asked_nothing_yet_is_left_at_the_end() -> None:
 
 def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
     reported = rf"127.0.0.1:{stage.view.port}: .*expected an address of this machine and a port"
-    with pytest.raises(ConfigError, match=reported), staged(port=stage.view.port):
+    with pytest.raises(ConfigError, match=reported), run_viewer(port=stage.view.port):
         pass
 
 
@@ -305,7 +305,7 @@ def test_a_browser_shows_what_the_files_say(demo_raw, tmp_path, monkeypatch) -> 
             enough.wait(0.2)
 
     with (
-        staged() as stage,
+        run_viewer() as stage,
         Browser(tmp_path / "profile") as browser,
         stage.connect(),  # which never says that it is ready
         sender(pieces()) as source,

@@ -85,7 +85,7 @@ def misses(p: Problem, at: Fit, change: Floats) -> Floats:
     return np.concatenate(found)
 
 
-def whole(p: Problem, equations: Equations) -> tuple[Floats, Floats, Floats]:
+def whole_equations(p: Problem, equations: Equations) -> tuple[Floats, Floats, Floats]:
     """Rows of points by all unknowns, each bar's own behind the shared ones, and their normal equations."""
     rows = np.zeros((len(p.points), 2, 14 + 9 * len(p.transmitters)))
     rows[:, :, :14] = equations.rows[:, :, 9:-1]
@@ -113,7 +113,7 @@ def test_equations_are_those_of_numerical_slopes() -> None:
     found = linearize(p, at)
     at_rest = misses(p, at, np.zeros(32))
     slope = -approx_fprime(np.zeros(32), lambda x: misses(p, at, x), 1e-6)
-    _, matrix, side = whole(p, found)
+    _, matrix, side = whole_equations(p, found)
     scale = np.sqrt(np.diag(slope.T @ slope))
     # The roll is about the level forward axis, not the pitched one.
     even = slope / scale
@@ -130,7 +130,7 @@ def test_equations_are_those_of_numerical_slopes() -> None:
     assert linearize(p, behind) is None
 
 
-def fitted(p: Problem, position: Floats, rotation: Floats) -> Equations:
+def fit_problem(p: Problem, position: Floats, rotation: Floats) -> Equations:
     """Where the fit ends."""
     found, settled = fit_pose(p, Fit.at(p, position, rotation))
     assert settled
@@ -144,7 +144,7 @@ def test_the_fit_is_that_of_scipy() -> None:
     far = p.points.copy()
     far[4, 6] += 4.0
     p = dataclasses.replace(p, points=far)
-    found = fitted(p, position + np.array([0.5, -0.4, 0.2]), rotation)
+    found = fit_problem(p, position + np.array([0.5, -0.4, 0.2]), rotation)
     fit = found.at
     start = Fit.at(p, position, rotation)
 
@@ -161,7 +161,7 @@ def test_the_fit_is_that_of_scipy() -> None:
     scipy = least_squares(cost, np.zeros(31), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
     # The roll is about the level forward axis, not the pitched one.
     assert found.cost == pytest.approx(2 * scipy.cost, rel=5e-5)
-    spread = np.linalg.inv(whole(p, found)[1][np.ix_(free_of(p), free_of(p))])
+    spread = np.linalg.inv(whole_equations(p, found)[1][np.ix_(free_of(p), free_of(p))])
     sigma = np.sqrt(np.diag(spread)[:3])
     np.testing.assert_allclose(fit.position / sigma, (position + scipy.x[:3]) / sigma, atol=0.03)
     np.testing.assert_allclose(fit.lens, scipy.x[6:13], atol=0.03)
@@ -229,10 +229,10 @@ def test_clusters_that_count() -> None:
 def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
     """Covariance, its causes and what errors of sites do, by the inverse of the whole matrix."""
     p, position, rotation = problem(np.random.default_rng(12), bars, noise=1.0)
-    equations = fitted(p, position, rotation)
+    equations = fit_problem(p, position, rotation)
     pose, keep = assess_fit(equations), free_of(p)
     assert isinstance(pose, Pose)
-    rows, matrix, _ = whole(p, equations)
+    rows, matrix, _ = whole_equations(p, equations)
     spread = np.zeros((14 + 9 * bars, 14 + 9 * bars))
     spread[np.ix_(keep, keep)] = np.linalg.inv(matrix[np.ix_(keep, keep)])
     np.testing.assert_allclose(pose.covariance, spread[:6, :6], rtol=1e-6, atol=1e-12)
@@ -312,7 +312,7 @@ def test_protection_levels_hold_with_any_bar_at_fault() -> None:
     """The widest of what a bar that stands anywhere may hide, each told by its own test."""
     p, position, rotation = problem(np.random.default_rng(12), 3, noise=1.0)
     p = dataclasses.replace(p, spec=dataclasses.replace(p.spec, bar_fault_m=0.0))
-    fit = fitted(p, position, rotation)
+    fit = fit_problem(p, position, rotation)
     found, spread = assess_fit(fit), fit.spread
     assert isinstance(found, Pose)
     risk = stats.chi2.isf(SPEC.risk, 1)

@@ -26,7 +26,7 @@ SPEC = ErrorModel(acceleration_m2_s3=0.5, gnss_s=4.0, gate_sigmas=50.0)
 SIGMA_M = {"bars": np.array([0.03, 0.05, 0.02]), GNSS: np.array([0.8, 0.6, 1.5])}
 
 
-def mixed() -> list[tuple[float, str]]:
+def mixed_sources() -> list[tuple[float, str]]:
     """Bars at first and last, satellites all the time."""
     seen = [(0.04 + 0.1 * i, GNSS) for i in range(60)]
     seen += [(0.1 * i + 0.013, "bars") for i in range(60) if not 15 < i < 45]
@@ -35,7 +35,7 @@ def mixed() -> list[tuple[float, str]]:
 
 def drive(rng: np.random.Generator) -> list[Fix]:
     found = []
-    for t_s, source in mixed():
+    for t_s, source in mixed_sources():
         place = np.array([3.0, 20.0, 0.1]) * t_s + 0.3 * SIGMA_M[source] * rng.normal(size=3)
         spread, share = np.diag(SIGMA_M[source] ** 2), SPEC.gnss_white_share if source == GNSS else 1.0
         known = {"standing": {GNSS: np.sqrt((1 - share) * spread)}} if source == GNSS else {}
@@ -64,7 +64,7 @@ def test_the_track_is_the_gaussian_process() -> None:
     smooth = smooth_trajectory(filter_fixes(fixes, SPEC), SPEC)
     assert [cause.name for cause in smooth[-1].causes] == [GNSS]
     for axis in range(3):
-        places, errors = process(mixed(), axis)
+        places, errors = process(mixed_sources(), axis)
         weight = np.linalg.solve(places + errors, places).T
         seen = np.array([one.enu_m[axis] for one in fixes])
         mean, spread = weight @ (seen - seen[0]) + seen[0], places - weight @ places

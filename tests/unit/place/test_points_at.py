@@ -24,7 +24,7 @@ LINE = math.sqrt(np.linalg.inv(np.vander(T_US / 1e4, 2).T @ np.vander(T_US / 1e4
 """Sigma at 0 of a straight line through the frames, of errors of 1."""
 
 
-def seen(points_px, sigma_px, spec=SPEC, layout_m=LINE_M, flank_px=math.nan, t_us=T_US) -> BarView:
+def view_of_frames(points_px, sigma_px, spec=SPEC, layout_m=LINE_M, flank_px=math.nan, t_us=T_US) -> BarView:
     """A bar at 0 by its frames, float64 (9, 16, 2)."""
     frames = [
         replace(frame(points, sigma_px, t), points_flank_px=flank_px)
@@ -53,7 +53,7 @@ def trials(
         pixel = np.einsum("ij,jkl->ikl", root, rng.normal(0, pixel_px, (9, 16, 2)))
         points = BAR_PX + course + pixel + rng.normal(0, white_px, (9, 16, 2))
         points[:, :, 0] += 60.0 * LEVER * rng.normal(0, lean, 9)[:, None]
-        views.append(seen(points, stated_px, spec))
+        views.append(view_of_frames(points, stated_px, spec))
         errors.append(views[-1].points_px - BAR_PX)
     off = np.array(errors)
     reported = ([getattr(view, name) for view in views] for name in ("sigma_px", "pixel_px", "across"))
@@ -96,13 +96,13 @@ def test_errors_across_a_bar_are_stated_by_what_it_shows(across_px: float) -> No
     assert 1.0 < np.mean(along**2) / there[1] < 1.5
 
 
-def seen_as(layout_m: Floats, noise_px: float, seed: int) -> BarView:
+def view_of_layout(layout_m: Floats, noise_px: float, seed: int) -> BarView:
     """A layout some 50 m ahead, turned and leaning, with errors that all frames share."""
     rng = np.random.default_rng(seed)
     turned = layout_m @ Rotation.from_euler("xyz", [25.0, 20.0, 10.0], degrees=True).as_matrix().T
     image = 640.0 + 7000.0 * turned[:, :2] / (50.0 + turned[:, 2:])
     points = image + rng.normal(0, noise_px, image.shape)
-    return seen(np.repeat(points[None], 9, 0), 0.06, EXACT, layout_m)
+    return view_of_frames(np.repeat(points[None], 9, 0), 0.06, EXACT, layout_m)
 
 
 @pytest.mark.parametrize("shape", ["line", "columns", "ring"])
@@ -115,18 +115,18 @@ def test_a_layouts_own_form_and_its_perspective_are_no_errors(shape: str) -> Non
         "ring": (0.4 * np.cos(turn), 0.4 * np.sin(turn)),
     }[shape]
     layout_m = np.stack([*places, np.zeros(16)], 1)
-    exact = seen_as(layout_m, 0.0, 0)
+    exact = view_of_layout(layout_m, 0.0, 0)
     assert exact.across * exact.sigma_px.mean() < 0.003
     # What stands over all frames does not scatter, and is shown.
-    bars = [seen_as(layout_m, 0.05, seed) for seed in range(200)]
+    bars = [view_of_layout(layout_m, 0.05, seed) for seed in range(200)]
     squares = [(found.across * found.sigma_px.mean()) ** 2 for found in bars]
     assert 1.2 < np.mean(squares) / 0.05**2 < 2.2
 
 
 def test_too_few_clusters_show_nothing_of_their_errors_and_points_without_are_not_exact() -> None:
     still = np.repeat(BAR_PX[None], 9, 0)
-    assert seen(still[:, :4], 0.1, replace(EXACT, min_points=2), LINE_M[:4]).across == 1.0
-    assert seen(still, 0.1, EXACT).across == pytest.approx(0.1)
+    assert view_of_frames(still[:, :4], 0.1, replace(EXACT, min_points=2), LINE_M[:4]).across == 1.0
+    assert view_of_frames(still, 0.1, EXACT).across == pytest.approx(0.1)
 
 
 def test_what_a_thin_line_does_not_show_is_that_of_a_sampled_profile() -> None:
@@ -146,14 +146,14 @@ def test_what_a_thin_line_does_not_show_is_that_of_a_sampled_profile() -> None:
 @pytest.mark.parametrize(("step_px", "least", "most"), [(0.0, 1.0, 1.0), (0.2, 0.9, 1.0), (5.0, 0.7, 0.85)])
 def test_what_is_not_shown_averages_as_the_image_moves(step_px: float, least: float, most: float) -> None:
     points = BAR_PX + T_US[:, None, None] / 3600.0 * np.array([step_px, 0.0])
-    assert least - 1e-9 <= seen(points, 0.1, flank_px=0.6).shift_px / unseen_px(0.6) <= most + 1e-9
-    assert seen(points, 0.1).shift_px == 0.0
+    assert least - 1e-9 <= view_of_frames(points, 0.1, flank_px=0.6).shift_px / unseen_px(0.6) <= most + 1e-9
+    assert view_of_frames(points, 0.1).shift_px == 0.0
 
 
 def test_a_moving_image_is_seen_early_or_late_by_its_speed() -> None:
     for px_per_ms in (0.0, 2.0, 6.0):
         points = BAR_PX + T_US[:, None, None] / 1000.0 * np.array([0.6, -0.8]) * px_per_ms
-        found = seen(points, 0.1, replace(SPEC, early_sigma_us=15.0))
+        found = view_of_frames(points, 0.1, replace(SPEC, early_sigma_us=15.0))
         assert found.early_px == pytest.approx(0.015 * px_per_ms, abs=1e-12)
 
 
@@ -162,7 +162,7 @@ def test_a_gap_beside_a_fix_is_known_by_how_far_a_polynomial_may_be_off() -> Non
     for t_us in (T_US, np.where(T_US > 0, T_US + 2600.0, T_US)):
         quartic = 1e-16 * t_us**4
         points = BAR_PX + quartic[:, None, None] * np.array([1.0, 0.0])
-        found = seen(points, 0.1, t_us=t_us)
+        found = view_of_frames(points, 0.1, t_us=t_us)
         midway = 1e-16 * 0.5625 * 3600.0**4
         off = abs(found.points_px[:, 0].mean() - 300.0)
         assert found.between == pytest.approx(off / midway, rel=1e-6)
@@ -175,30 +175,30 @@ STRETCHED = replace(STRETCHED, shared_along_px=ErrorModel.shared_along_px, stret
 SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
 
 
-def ranged(x_px: float, y_px: float, distance_m: float, sigma_m: float) -> Frame:
+def ranged_frame(x_px: float, y_px: float, distance_m: float, sigma_m: float) -> Frame:
     return Frame(0, 0, 0, 0.0, SOFT, Range(distance_m, sigma_m, 10), None, x_px, y_px)
 
 
 def test_the_point_is_the_one_that_is_seen() -> None:
     true = np.array([3.0, -2.0, 40.0])
     x, y = BENT.project(true)
-    found = bar_point(ranged(x, y, 40.0, 0.1), 0.96, BENT)
+    found = bar_point(ranged_frame(x, y, 40.0, 0.1), 0.96, BENT)
     np.testing.assert_allclose(found.point_m, true, atol=1e-6)
     # The sigma of the distance is along the line of sight, not along the axis.
     along = true / 40.0
     spec = replace(POINTS_ONLY, stretch_share=0.001)
-    exact = bar_point(ranged(x, y, 40.0, 0.1), 0.96, BENT, spec=spec)
+    exact = bar_point(ranged_frame(x, y, 40.0, 0.1), 0.96, BENT, spec=spec)
     stretched = 0.1**2 + (40 * 0.001) ** 2
     np.testing.assert_allclose(exact.covariance_m2, stretched * np.outer(along, along), atol=1e-9)
     # Without a distance, or its sigma, there is none.
     for distance_m in (math.nan, 40.0):
-        assert bar_point(ranged(x, y, distance_m, math.nan), 0.96, BENT) is None
+        assert bar_point(ranged_frame(x, y, distance_m, math.nan), 0.96, BENT) is None
 
 
 def test_what_bends_a_bar_stays_over_frames() -> None:
-    bent = replace(ranged(640.0, 360.0, 40.0, 0.5), range=Range(40.0, 0.5, 10, standing_m=0.4))
+    bent = replace(ranged_frame(640.0, 360.0, 40.0, 0.5), range=Range(40.0, 0.5, 10, standing_m=0.4))
     found = bar_point(bent, 0.96, BENT, spec=replace(POINTS_ONLY, stretch_share=0.0))
-    straight = bar_point(ranged(640.0, 360.0, 40.0, 0.5), 0.96, BENT, spec=POINTS_ONLY)
+    straight = bar_point(ranged_frame(640.0, 360.0, 40.0, 0.5), 0.96, BENT, spec=POINTS_ONLY)
     np.testing.assert_allclose(found.covariance_m2, straight.covariance_m2, rtol=1e-3, atol=1e-6)
     assert found.standing[2, 7] == pytest.approx(0.4)
     frames = [replace(frame(BAR_PX, 0.1, t), range=bent.range) for t in T_US.tolist()]
@@ -221,7 +221,7 @@ def test_every_error_is_in_its_covariance() -> None:
         x, y = lens.project(true) + rng.normal(0, shift, 2)
         # By its length in the image a bar is the farther, the longer the lens is said to be.
         distance = 25 * BENT.focal_px / lens.focal_px * (1 + 0.004 * rng.normal()) + 0.15 * rng.normal()
-        found = bar_point(ranged(x, y, distance, 0.15), 0.96, BENT, LENS, STRETCHED)
+        found = bar_point(ranged_frame(x, y, distance, 0.15), 0.96, BENT, LENS, STRETCHED)
         squares.append(square(found.point_m - true, found.covariance_m2))
     assert by_chance(squares, 3, 0.999)
     assert np.linalg.eigvalsh(found.covariance_m2 - found.standing @ found.standing.T)[0] > 0

@@ -46,7 +46,7 @@ def views(bars, position, rotation, rng=None, noise_px=0.3, camera=CAMERA, acros
     return seen
 
 
-def drawn(
+def draw_scene(
     rng: np.random.Generator, places: list[Place], known: Attitude | None,
     survey: tuple[float, float, float] = (0.0, 0.0, 0.0), focal: float = 0.0, across: float = 1.0,
     spec: ErrorModel = USUAL, noise_px: float = 0.1, between: tuple[float, ...] = (1.0, 1.0, 1.0),
@@ -75,7 +75,7 @@ def drawn(
     return seen, reported, CameraSigma(focal_mm=focal * CAMERA.focal_mm)
 
 
-def moved(view: BarView, *by_m: float) -> BarView:
+def move_site(view: BarView, *by_m: float) -> BarView:
     """A bar whose site is said to be elsewhere."""
     return replace(view, enu_m=view.enu_m + np.array(by_m))
 
@@ -84,18 +84,18 @@ def at_each_others(one: BarView, two: BarView) -> list[BarView]:
     return [replace(one, enu_m=two.enu_m), replace(two, enu_m=one.enu_m)]
 
 
-def solved(found: Pose | Rejection) -> Pose:
+def as_pose(found: Pose | Rejection) -> Pose:
     assert isinstance(found, Pose), found
     return found
 
 
-def refused(found: Pose | Rejection) -> Rejection:
+def as_rejection(found: Pose | Rejection) -> Rejection:
     assert isinstance(found, Rejection), found
     assert found.detail
     return found
 
 
-def squared(pose: Pose) -> float:
+def squared_error(pose: Pose) -> float:
     """The square of the error of a camera at the origin."""
     return square(pose.enu_m, pose.covariance[:3, :3])
 
@@ -161,14 +161,14 @@ POINTS = {"spec": POINTS_ONLY, "noise_px": 0.3}
 def test_every_error_that_is_stated_is_in_the_covariance(places, known, errors, most_m) -> None:
     rng, squares, off_m, open_ones = np.random.default_rng(11), [], [], 0
     for _ in range(120):
-        seen, reported, sigma = drawn(rng, places, known, **errors)
+        seen, reported, sigma = draw_scene(rng, places, known, **errors)
         found = solve_pose(seen, CAMERA, reported, errors.get("spec", USUAL), sigma)
         if isinstance(found, Rejection):
             # Two bars on gravity and a survey of 5 cm leave metres along an arc.
             assert found.kind in ("uncertain", "two-solutions"), found
             open_ones += 1
             continue
-        squares.append(squared(found))
+        squares.append(squared_error(found))
         off_m.append(np.linalg.norm(found.enu_m))
         parts = found.noise + found.slow + sum(s @ s.T for s in found.standing.values())
         # What Huber's weights take from a few points is the difference.
@@ -185,8 +185,8 @@ def test_bars_whose_frames_leave_gaps_at_other_times_err_apart(between, known) -
     """The image moves as one, and each bar's place is interpolated by its own frames."""
     rng, spec, squares = np.random.default_rng(6), replace(POINTS_ONLY, shaken_sigma_px=0.1), []
     for _ in range(200):
-        seen, reported, _ = drawn(rng, POLES, known, spec=spec, noise_px=0.05, between=between)
-        squares.append(squared(solved(solve_pose(seen, CAMERA, reported, spec))))
+        seen, reported, _ = draw_scene(rng, POLES, known, spec=spec, noise_px=0.05, between=between)
+        squares.append(squared_error(as_pose(solve_pose(seen, CAMERA, reported, spec))))
     # What bars have for their own counts as independent of what they share, though it is the same motion.
     assert 1.9 < np.mean(squares) < 3.6
 
@@ -194,8 +194,8 @@ def test_bars_whose_frames_leave_gaps_at_other_times_err_apart(between, known) -
 @pytest.mark.parametrize(("which", "way"), list(enumerate(np.eye(3))))
 @pytest.mark.parametrize("known", [COMPASS, GRAVITY])
 def test_a_bar_that_disagrees_is_left_out_by_name(which: int, way: Floats, known: Attitude) -> None:
-    seen, reported, _ = drawn(np.random.default_rng(13), THREE, known)
-    seen[which] = moved(seen[which], *0.5 * way)
+    seen, reported, _ = draw_scene(np.random.default_rng(13), THREE, known)
+    seen[which] = move_site(seen[which], *0.5 * way)
     found = solve_pose(seen, CAMERA, reported)
     if isinstance(found, Rejection):
         # A pair that stays cannot always tell which of three is wrong; it never says a place.
@@ -204,16 +204,16 @@ def test_a_bar_that_disagrees_is_left_out_by_name(which: int, way: Floats, known
         return
     assert found.excluded == (f"bar {which}",)
     assert which not in found.transmitters
-    assert squared(found) < stats.chi2.isf(1e-5, 3)
+    assert squared_error(found) < stats.chi2.isf(1e-5, 3)
 
 
 @pytest.mark.parametrize("across", [0.3, 1.0, 2.0])
 def test_where_a_left_out_bar_stands_is_the_weighted_fit_of_its_points(across: float) -> None:
     """Least squares with the points' whole covariance, along the bar and across; and of the pose."""
     rng, spec = np.random.default_rng(34), ErrorModel()
-    seen, reported, sigma = drawn(rng, THREE, COMPASS, (2e-4, 0.0, 0.0), across=across)
-    wrong = moved(seen[1], -0.3, 0.4, -0.2)
-    pose = solved(solve_pose(seen, CAMERA, reported, spec))
+    seen, reported, sigma = draw_scene(rng, THREE, COMPASS, (2e-4, 0.0, 0.0), across=across)
+    wrong = move_site(seen[1], -0.3, 0.4, -0.2)
+    pose = as_pose(solve_pose(seen, CAMERA, reported, spec))
     # As sure as the bar's image, so that each part of the covariance counts.
     pose = replace(pose, covariance=0.1 * pose.covariance)
     problem = Problem.of([seen[0], wrong, seen[2]], CAMERA, reported, spec, sigma)
@@ -246,16 +246,16 @@ def test_where_a_left_out_bar_stands_is_the_weighted_fit_of_its_points(across: f
 
 
 def test_an_attitude_that_disagrees_is_left_out_by_name() -> None:
-    seen, reported, _ = drawn(np.random.default_rng(14), THREE, COMPASS)
+    seen, reported, _ = draw_scene(np.random.default_rng(14), THREE, COMPASS)
     assert reported is not None
     for change, part in (({"heading_deg": 3.0}, "heading"), ({"roll_deg": 2.0}, "attitude")):
-        found = solved(solve_pose(seen, CAMERA, replace(reported, **change)))
+        found = as_pose(solve_pose(seen, CAMERA, replace(reported, **change)))
         assert (found.excluded, found.failed) == ((part,), None)
         assert abs(math.remainder(Attitude.of_rotation(found.rotation).heading_deg or 0, 360)) < 0.3
         assert np.linalg.norm(found.enu_m) < 0.3
     # Of two bars, either may be the wrong one; so may the heading.
-    seen[0] = moved(seen[0], 0.0, 0.0, 0.5)
-    both = refused(solve_pose(seen[:2], CAMERA, reported))
+    seen[0] = move_site(seen[0], 0.0, 0.0, 0.5)
+    both = as_rejection(solve_pose(seen[:2], CAMERA, reported))
     assert both.kind == "misfit"
     assert {"bar 0", "bar 1"} <= set(both.suspects)
 
@@ -271,7 +271,7 @@ def test_a_focal_length_that_is_another_lens_is_found(said_mm: float) -> None:
         assert found.kind == "misfit" if isinstance(found, Rejection) else found.excluded
         assert fitting_focal_mm(seen, reported, known) == pytest.approx(35.0, rel=0.04)
     # None fits a bar that is moved aside.
-    assert math.isnan(fitting_focal_mm([moved(seen[0], 0.0, 0.0, 0.5), seen[1]], CAMERA, UP))
+    assert math.isnan(fitting_focal_mm([move_site(seen[0], 0.0, 0.0, 0.5), seen[1]], CAMERA, UP))
 
 
 def test_two_sites_mixed_up_are_not_a_third_bar_at_fault() -> None:
@@ -280,9 +280,9 @@ def test_two_sites_mixed_up_are_not_a_third_bar_at_fault() -> None:
     bars = [bar((-2.0, 50.0, 4.5)), bar((2.0, 54.0, 4.5)), bar((0.0, 58.0, 5.5), (1, 0, 0.02))]
     seen = views(bars, np.zeros(3), UP.rotation(), rng, 0.1)
     mixed = [*at_each_others(*seen[:2]), seen[2]]
-    behind = solved(solve_pose(mixed[:2], CAMERA, GRAVITY))
+    behind = as_pose(solve_pose(mixed[:2], CAMERA, GRAVITY))
     assert np.linalg.norm(behind.enu_m) > 80
-    found = refused(solve_pose(mixed, CAMERA, GRAVITY))
+    found = as_rejection(solve_pose(mixed, CAMERA, GRAVITY))
     assert found.kind == "misfit"
     assert "bar 0 at the site of bar 1 and the reverse" in found.detail
 
@@ -293,11 +293,11 @@ def test_protection_levels_cover_what_no_test_finds() -> None:
     hidden = 0
     for trial in range(60):
         three = trial % 2
-        seen, reported, _ = drawn(rng, THREE if three else POLES, COMPASS)
+        seen, reported, _ = draw_scene(rng, THREE if three else POLES, COMPASS)
         camera, size = CAMERA, 10 ** rng.uniform(-2, 0)
         which = trial % 3
         if which == 0:
-            seen[0] = moved(seen[0], *size * rng.normal(size=3))
+            seen[0] = move_site(seen[0], *size * rng.normal(size=3))
         elif which == 1:
             reported = replace(reported, pitch_deg=reported.pitch_deg + size)
         else:
@@ -307,7 +307,7 @@ def test_protection_levels_cover_what_no_test_finds() -> None:
             continue
         assert math.hypot(*found.enu_m[:2]) < found.hpl_m
         assert abs(found.enu_m[2]) < found.vpl_m
-        hidden += squared(found) > stats.chi2.isf(0.0027, 3)
+        hidden += squared_error(found) > stats.chi2.isf(0.0027, 3)
     assert hidden > 8
 
 
@@ -316,12 +316,12 @@ def test_two_bars_that_may_be_mixed_up_are_protected_as_far_as_behind_them() -> 
     rng, spec = np.random.default_rng(19), ErrorModel(bar_fault_m=0.5)
     both = [bar(POLES[0]), bar((4.0, 46.0, 5.5))], [bar(place) for place in POLES]
     other, seen = (views(bars, np.zeros(3), UP.rotation(), rng, 0.1) for bars in both)
-    assert math.isfinite(solved(solve_pose(other, CAMERA, GRAVITY, spec)).hpl_m)
-    pose = solved(solve_pose(seen, CAMERA, GRAVITY, spec))
+    assert math.isfinite(as_pose(solve_pose(other, CAMERA, GRAVITY, spec)).hpl_m)
+    pose = as_pose(solve_pose(seen, CAMERA, GRAVITY, spec))
     assert math.isinf(pose.hpl_m)
-    behind = solved(solve_pose(at_each_others(*seen), CAMERA, GRAVITY, spec))
+    behind = as_pose(solve_pose(at_each_others(*seen), CAMERA, GRAVITY, spec))
     apart = np.hypot(*(behind.enu_m - pose.enu_m)[:2])
-    reach = solved(solve_pose(seen, CAMERA, GRAVITY, replace(spec, max_protection_m=300.0)))
+    reach = as_pose(solve_pose(seen, CAMERA, GRAVITY, replace(spec, max_protection_m=300.0)))
     sigma = np.linalg.eigvalsh(behind.covariance[:2, :2])[-1] ** 0.5
     assert reach.hpl_m == pytest.approx(apart + stats.chi2.isf(1e-4, 2) ** 0.5 * sigma, rel=1e-6)
 
@@ -335,20 +335,20 @@ def test_levels_hold_for_faults_of_the_size_that_is_stated(fault: str, size: flo
     usual = ErrorModel(bar_fault_m=0.01, attitude_fault_deg=0.1)
     stated, spared = (replace(usual, **{fault: value}) for value in (size, 0.0))
     for trial in range(40):
-        (seen,), reported, _ = drawn(rng, POLES[:1], COMPASS)
+        (seen,), reported, _ = draw_scene(rng, POLES[:1], COMPASS)
         camera, off = CAMERA, (-1) ** trial * 2.0 * size
         if fault == "bar_fault_m":
-            seen = moved(seen, off, 0.0, 0.0)
+            seen = move_site(seen, off, 0.0, 0.0)
         elif fault == "attitude_fault_deg":
             reported = replace(reported, heading_deg=(reported.heading_deg or 0.0) + off)
         else:
             camera = replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + off))
-        pose, other = (solved(solve_pose([seen], camera, reported, spec)) for spec in (stated, usual))
+        pose, other = (as_pose(solve_pose([seen], camera, reported, spec)) for spec in (stated, usual))
         assert math.hypot(*pose.enu_m[:2]) < pose.hpl_m < 50
         assert abs(pose.enu_m[2]) < pose.vpl_m < 50
         outside += math.hypot(*other.enu_m[:2]) > other.hpl_m
         # A part that may be off by any amount leaves nothing protected.
-        assert math.isinf(solved(solve_pose([seen], camera, reported, spared)).hpl_m)
+        assert math.isinf(as_pose(solve_pose([seen], camera, reported, spared)).hpl_m)
     assert outside > 20
 
 
@@ -357,7 +357,7 @@ def test_false_alarms_are_as_rare_as_stated() -> None:
     rng, spec = np.random.default_rng(18), ErrorModel(false_alarm=0.02)
     alarms = 0
     for _ in range(200):
-        seen, reported, sigma = drawn(rng, THREE, COMPASS, SURVEY, 0.002)
+        seen, reported, sigma = draw_scene(rng, THREE, COMPASS, SURVEY, 0.002)
         found = solve_pose(seen, CAMERA, reported, spec, sigma)
         alarms += isinstance(found, Rejection) or bool(found.excluded)
     # Tests of overlapping parts share alarms, and the total is counted by Huber: never more, and not none.
@@ -370,7 +370,7 @@ def test_what_is_not_determined_is_refused() -> None:
     def kind_of(places, known, spec=USUAL, axis=(0, 0, 1)) -> str:
         seen = views([bar(p, axis) for p in places], np.zeros(3), UP.rotation(), rng, 0.1)
         found = solve_pose(seen, CAMERA, known, spec)
-        return refused(found).kind if isinstance(found, Rejection) else ""
+        return as_rejection(found).kind if isinstance(found, Rejection) else ""
 
     def in_line(up_m: float) -> list[Place]:
         return [(-4.0, 50.0, 4.5), (0.0, 50.0, up_m), (4.0, 50.0, 4.5)]
@@ -378,7 +378,7 @@ def test_what_is_not_determined_is_refused() -> None:
     assert kind_of([], COMPASS) == "too-few-clusters"
     (few,) = views([bar(POLES[0])], np.zeros(3), UP.rotation(), rng, 0.1)
     few.points_px[5:] = np.nan
-    assert refused(solve_pose([few], CAMERA, COMPASS)).kind == "too-few-clusters"
+    assert as_rejection(solve_pose([few], CAMERA, COMPASS)).kind == "too-few-clusters"
     assert kind_of(POLES[:1], LEVEL) == "heading-unknown"
     assert kind_of(POLES, None) == "gravity-unknown"
     # In line, hardly beside the line, and clearly.
@@ -386,13 +386,13 @@ def test_what_is_not_determined_is_refused() -> None:
     # At the camera's own height, two bars leave a circle through them; ranges alone say where on it.
     low = views([bar((x, 50.0, 0.0)) for x in (-3.0, 3.0)], np.zeros(3), Attitude().rotation(), rng, 0.3)
     found = solve_pose(low, CAMERA, Attitude(gravity_sigma_deg=0.0))
-    assert refused(found).kind in ("uncertain", "not-determined", "two-solutions")
+    assert as_rejection(found).kind in ("uncertain", "not-determined", "two-solutions")
     assert kind_of(POLES[:1], COMPASS, ErrorModel(max_sigma_m=0.01)) == "uncertain"
     # A bar that points at the camera.
     sight = np.array(POLES[0]) / np.linalg.norm(POLES[0])
     assert kind_of(POLES[:1], COMPASS, USUAL, sight + np.array([0.1, 0, 0])) == "end-on"
     swapped = at_each_others(*views([bar(p) for p in POLES], np.zeros(3), UP.rotation(), rng, 0.1))
-    assert refused(solve_pose(swapped, CAMERA, COMPASS)).kind in ("misfit", "not-determined")
+    assert as_rejection(solve_pose(swapped, CAMERA, COMPASS)).kind in ("misfit", "not-determined")
 
 
 def test_both_poses_are_reported_where_two_fit() -> None:
@@ -400,7 +400,7 @@ def test_both_poses_are_reported_where_two_fit() -> None:
     rng = np.random.default_rng(0)
     bars = [0.1 * bar((0, 0, 0)) + [-2.6, 58.4, 3.9], 0.1 * bar((0, 0, 0)) + [0.5, 57.1, 5.8]]
     seen = views(bars, np.zeros(3), UP.rotation(), rng, 1.0)
-    found = refused(solve_pose(seen, CAMERA, GRAVITY, POINTS_ONLY))
+    found = as_rejection(solve_pose(seen, CAMERA, GRAVITY, POINTS_ONLY))
     assert found.kind == "two-solutions"
     likelihoods = [one.likelihood for one in found.candidates]
     assert likelihoods[0] == 1
@@ -444,6 +444,6 @@ def test_a_pitch_of_the_wrong_sign_is_not_a_bar_at_fault() -> None:
         bars = [bar(place, (rng.normal(0, 0.01), rng.normal(0, 0.01), 1)) for place in places]
         seen = views(bars, np.zeros(3), Attitude(pitch, 0.0, 0.0).rotation(), rng, 0.07)
         found = solve_pose(seen, CAMERA, Attitude(-pitch, 0.0, 0.0, 0.1, 0.1))
-        assert refused(found).kind == "misfit"
+        assert as_rejection(found).kind == "misfit"
         suspects.append(found.suspects)
     assert sum("attitude" in some for some in suspects) >= 15

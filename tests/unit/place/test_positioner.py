@@ -57,7 +57,7 @@ def packets_of(bar: BarSite, transmitter: int, count: int, start_us: float = 500
     return found
 
 
-def merged(*streams: list[Packet]) -> list[Packet]:
+def merge(*streams: list[Packet]) -> list[Packet]:
     return sorted((p for s in streams for p in s), key=lambda p: p.t_us)
 
 
@@ -105,7 +105,7 @@ def test_bars_of_two_links_give_one_fix() -> None:
     one, lamp = packets_of(LEFT, 0, 8, link="long"), packets_of(LEFT, 2, 8, link="lamp")
     other = packets_of(right, 1, 8, enu=right.cluster_positions_m(8, ORIGIN), link="short")
     p = Positioner(CAMERA, kinds, [right, left], lambda _t: gravity)
-    fixes = fixes_of(p, merged(one, other, lamp))
+    fixes = fixes_of(p, merge(one, other, lamp))
     assert_right(fixes)
     assert [fix.transmitters for fix in fixes] == [(0, 1)] * len(fixes)
     assert p.links_of(fixes[0]) == "long short"
@@ -114,7 +114,7 @@ def test_bars_of_two_links_give_one_fix() -> None:
     assert np.diff([fix.t_us for fix in fixes]) == pytest.approx(1.3 * PACKET_US)
     # The same fixes, packet by packet.
     again = Positioner(CAMERA, kinds, [right, left], lambda _t: gravity)
-    pieces = [fix for packet in merged(one, other, lamp) for fix in again.feed([packet])] + again.close()
+    pieces = [fix for packet in merge(one, other, lamp) for fix in again.feed([packet])] + again.close()
     assert [fix.enu_m.tolist() for fix in pieces] == [fix.enu_m.tolist() for fix in fixes]
     # Both have the number of the site, which names neither: each bar is where its own link stands.
     elsewhere = dataclasses.replace(left, link="short", transmitter=0)
@@ -146,7 +146,7 @@ def test_two_bars_of_other_phases_give_the_heading() -> None:
     turned = Attitude(4.0, 1.0, 359.0, 0.0, 0.0)
     p = positioner([LEFT, RIGHT], Attitude(4.0, 1.0, None, 0.0))
     left, right = packets_of(LEFT, 0, 8, attitude=turned), packets_of(RIGHT, 1, 8, 21_000.0, attitude=turned)
-    fixes = fixes_of(p, merged(left, right))
+    fixes = fixes_of(p, merge(left, right))
     both = [f for f in fixes if f.transmitters == (0, 1) and not f.refusal]
     assert len(both) >= 6
     assert_right(both, 5e-3)
@@ -174,7 +174,7 @@ def test_gravity_and_north_are_those_of_the_place_not_of_the_first_site() -> Non
 @pytest.mark.parametrize("known_from", [0, 2])
 def test_a_mirror_image_is_no_bar(known_from: int) -> None:
     """The bar's image in a wet road, upside down under it, repeats its beacon; fixes are those of the bar."""
-    reported = {n: (heard(LEFT, "verified", 0),) for n in range(8)}
+    reported = {n: (received_beacon(LEFT, "verified", 0),) for n in range(8)}
     own = packets_of(LEFT, 0, 8, messages=reported)
     image = []
     for n, packet in enumerate(packets_of(LEFT, 1, 8, messages=reported)):
@@ -186,7 +186,7 @@ def test_a_mirror_image_is_no_bar(known_from: int) -> None:
         image.append(dataclasses.replace(packet, frames=frames, messages=() if echo_of == 0 else reported[0]))
     # No site names a transmitter, so that only a bar that is alone stands there by its number.
     want, both = fixes_of(positioner([LEFT]), own), positioner([LEFT])
-    fixes = fixes_of(both, merged(own, image))
+    fixes = fixes_of(both, merge(own, image))
     # A fix waits for half a packet on both sides.
     late = [f for f in fixes if f.t_us > known_from * PACKET_US]
     assert_right(late)
@@ -195,7 +195,7 @@ def test_a_mirror_image_is_no_bar(known_from: int) -> None:
     assert set(both.bars.stands_at) == {0}
 
 
-def heard(bar: BarSite, trust: Trust, packet: int) -> ReceivedMessage:
+def received_beacon(bar: BarSite, trust: Trust, packet: int) -> ReceivedMessage:
     names = ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "tilt_deg", "length_m")
     beacon = Beacon(*(getattr(bar, name) for name in names))
     message = Message(Kind.BEACON, bar.transmitter_id, packet, beacon.pack())
@@ -205,12 +205,12 @@ def heard(bar: BarSite, trust: Trust, packet: int) -> ReceivedMessage:
 
 def test_beacons_tell_who_and_where() -> None:
     # The id decides, not the receiver's number, which is the other bar's here.
-    reported = {0: (heard(RIGHT, "unverified", 0),)}
+    reported = {0: (received_beacon(RIGHT, "unverified", 0),)}
     fixes = fixes_of(positioner([LEFT, RIGHT]), packets_of(RIGHT, 0, 6, messages=reported))
     assert_right(fixes)
     assert not any(f.verified for f in fixes)
     # Without a file, a verified beacon's own place is believed, until one is forged.
-    reported = {0: (heard(RIGHT, "verified", 0),), 4: (heard(LEFT, "forged", 4),)}
+    reported = {0: (received_beacon(RIGHT, "verified", 0),), 4: (received_beacon(LEFT, "forged", 4),)}
     p = positioner([])
     fixes = fixes_of(p, packets_of(RIGHT, 0, 9, messages=reported))
     given = [f for f in fixes if not f.refusal]
@@ -244,7 +244,7 @@ def test_which_beacons_are_believed(beacons, messages, known) -> None:
     """After each message: `+` its place is known and verified, `?` known, `-` not."""
     registry = BarRegistry([], ErrorModel(beacons=beacons))
     for message, mark in zip(messages, known, strict=True):
-        registry.add_packet(Packet(0, 0, 0.0, 100.0, (), 10, messages=(heard(*message),)))
+        registry.add_packet(Packet(0, 0, 0.0, 100.0, (), 10, messages=(received_beacon(*message),)))
         found = registry.site(0)
         assert (found is None) == (mark == "-")
         if found is not None:
@@ -257,8 +257,8 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
     """From behind two bars the image of swapped ones is the same; what they say of themselves tells."""
     gravity = Attitude(4.0, 1.0, None, 0.0, 0.0)
     swapped = [dataclasses.replace(LEFT, transmitter_id=9), dataclasses.replace(RIGHT, transmitter_id=7)]
-    reported = [{0: (heard(bar, "unverified", 0),)} for bar in (LEFT, RIGHT)]
-    stream = merged(
+    reported = [{0: (received_beacon(bar, "unverified", 0),)} for bar in (LEFT, RIGHT)]
+    stream = merge(
         packets_of(LEFT, 0, 6, messages=reported[0]), packets_of(RIGHT, 1, 6, messages=reported[1])
     )
     right = positioner([LEFT, RIGHT], gravity)
@@ -289,7 +289,7 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
 def test_a_bar_that_is_not_its_site(change: dict[str, float], expected: str | None) -> None:
     """A lone bar of the wrong length or place fits the image as well as the right one."""
     registry = BarRegistry([dataclasses.replace(LEFT, **change)], ErrorModel())
-    registry.add_packet(Packet(0, 0, 0.0, 100.0, (), 10, messages=(heard(LEFT, "unverified", 0),)))
+    registry.add_packet(Packet(0, 0, 0.0, 100.0, (), 10, messages=(received_beacon(LEFT, "unverified", 0),)))
     assert (registry.site(0) is None) == (expected is not None)
     assert (expected or "") in registry.contradiction(0)
     assert bool(expected) == bool(registry.contradiction(0))

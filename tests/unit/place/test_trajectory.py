@@ -46,7 +46,7 @@ def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
     assert max(p.mean[0] for p in smooth[:5]) < 10
 
 
-def disturbed(rng: np.random.Generator, count: int) -> list[Fix]:
+def random_fixes(rng: np.random.Generator, count: int) -> list[Fix]:
     """Fixes anywhere at uneven times, of the camera and two of three bars in turn, with all their errors."""
     found = []
     for t_s in np.cumsum(rng.uniform(0.01, 0.2, count)):
@@ -99,7 +99,7 @@ def dense(fixes: list[Fix], names: list[str]) -> tuple[Floats, Floats, Floats]:
 
 
 def test_standing_and_slow_errors_are_those_of_the_dense_problem() -> None:
-    fixes = disturbed(np.random.default_rng(21), 14)
+    fixes = random_fixes(np.random.default_rng(21), 14)
     spec = dataclasses.replace(SPEC, gate_sigmas=1e3)
     points = filter_fixes(fixes, spec)
     smooth = smooth_trajectory(points, spec)
@@ -149,7 +149,7 @@ def test_a_bar_long_out_of_sight_is_forgotten() -> None:
     assert max(abs(p.mean[0] - i) for i, p in enumerate(smooth)) < 1e-3
 
 
-def swayed(rng: np.random.Generator, fixes: int) -> tuple[list[Fix], Floats]:
+def biased_drive(rng: np.random.Generator, fixes: int) -> tuple[list[Fix], Floats]:
     """Fixes, and places, of a drive; standing errors of a metre move each as of where it is, with noise."""
     t_s, along, noise_m = 0.04 * np.arange(fixes), np.array([1.0, 0.0, 0.0]), 0.1
     place = rng.normal(0, 1, 3) + np.outer(t_s, [2.0, 8.0, 0.0])
@@ -174,7 +174,7 @@ def test_noise_does_not_show_errors_that_stay() -> None:
     kept: dict[str, list[float]] = {"forward": [], "smoothed": [], "as they are": [], "smoothed so": []}
     spec = dataclasses.replace(SPEC, acceleration_m2_s3=1e-2, gate_sigmas=50.0)
     for _ in range(30):
-        fixes, place = swayed(rng, 24)
+        fixes, place = biased_drive(rng, 24)
         plain = [dataclasses.replace(f, standing_slope={}) for f in fixes]
         forward, naive = filter_fixes(fixes, spec), filter_fixes(plain, spec)
         tracks = forward, smooth_trajectory(forward, spec), naive, smooth_trajectory(naive, spec)
@@ -206,7 +206,7 @@ def motion(push: bool) -> ImuMotion:
     return ImuMotion(t, 0.6 * t + 0.3 * np.sin(2 * t), True, pushed)
 
 
-def stepped(way, velocity, heading, imu, kicked_s=np.inf, turn=0.0, kick=0.0) -> Floats:
+def integrate(way, velocity, heading, imu, kicked_s=np.inf, turn=0.0, kick=0.0) -> Floats:
     """Place and velocity in the end, by many short steps; from a time on heading and velocity are off."""
     steps, end = 6000, way.t_s[-1]
     dt = end / steps
@@ -215,16 +215,16 @@ def stepped(way, velocity, heading, imu, kicked_s=np.inf, turn=0.0, kick=0.0) ->
     angle = np.interp(t, way.t_s, way.turn_rad) - bias[0] * t + turn * late[:, 0]
     speed = velocity + late * kick
     if way.acceleration_m_s2 is None:
-        speed = turned(speed, angle)
+        speed = turn_vectors(speed, angle)
     else:
         pushed = np.stack([np.interp(t, way.t_s, c) for c in way.acceleration_m_s2.T], 1) - bias[-3:]
-        rise = turned(pushed, heading + angle) * dt
+        rise = turn_vectors(pushed, heading + angle) * dt
         rise[-1] = 0
         speed = speed + np.cumsum(rise, 0) - rise / 2
     return np.append(speed[:-1].sum(0) * dt, speed[-1])
 
 
-def turned(vectors: Floats, angle: Floats) -> Floats:
+def turn_vectors(vectors: Floats, angle: Floats) -> Floats:
     """Vectors (n, 3) turned about up, clockwise."""
     level = (vectors[:, 0] + 1j * vectors[:, 1]) * np.exp(-1j * angle)
     return np.stack([level.real, level.imag, vectors[:, 2]], 1)
@@ -241,17 +241,19 @@ def test_the_way_is_that_of_short_steps(push: bool) -> None:
     way, imu = motion(push), np.array([3.0, 1.0, -2.0, 0.5])[: 4 if push else 1]
     found = reckon(way, VELOCITY, 0.4, 0.0, imu, STRONG)
     start = np.append(np.zeros(3), VELOCITY)
-    np.testing.assert_allclose(found.move @ start + found.added, stepped(way, VELOCITY, 0.4, imu), atol=2e-3)
-    by_speed = slopes(lambda off: stepped(way, VELOCITY + off, 0.4, imu), 3)
+    np.testing.assert_allclose(
+        found.move @ start + found.added, integrate(way, VELOCITY, 0.4, imu), atol=2e-3
+    )
+    by_speed = slopes(lambda off: integrate(way, VELOCITY + off, 0.4, imu), 3)
     np.testing.assert_allclose(found.move[:, 3:], by_speed, atol=1e-3)
-    by_imu = slopes(lambda off: stepped(way, VELOCITY, 0.4, imu + off), len(imu))
+    by_imu = slopes(lambda off: integrate(way, VELOCITY, 0.4, imu + off), len(imu))
     np.testing.assert_allclose(found.by_imu, by_imu, atol=1e-3)
 
 
 def test_headings_error_pushes_aside() -> None:
     way, imu = motion(True), np.zeros(4)
     exact, off = (reckon(way, VELOCITY, 0.4, sigma, imu, STRONG).noise for sigma in (0.0, 0.01))
-    slope = slopes(lambda turn: stepped(way, VELOCITY, 0.4 + turn[0], imu), 1)
+    slope = slopes(lambda turn: integrate(way, VELOCITY, 0.4 + turn[0], imu), 1)
     np.testing.assert_allclose(off - exact, 0.01**2 * slope @ slope.T, atol=1e-4)
 
 
@@ -263,7 +265,7 @@ def test_noise_is_that_of_kicks(push: bool) -> None:
     power = np.array([np.radians(STRONG.rate_white_deg_rts) ** 2, *3 * [white]])
     noise = np.zeros((6, 6))
     for s in (np.arange(120) + 0.5) * 3 / 120:
-        by = slopes(lambda k, s=s: stepped(way, VELOCITY, 0.4, imu, s, k[0], k[1:]), 4)
+        by = slopes(lambda k, s=s: integrate(way, VELOCITY, 0.4, imu, s, k[0], k[1:]), 4)
         noise += 3 / 120 * (by * power) @ by.T
     np.testing.assert_allclose(reckon(way, VELOCITY, 0.4, 0.0, imu, STRONG).noise, noise, atol=5e-3)
 

@@ -32,7 +32,9 @@ def boom(*_: object) -> Any:
     raise KeyError("boom")
 
 
-def heard(t_us: float, packet: int = 0, frame: int = 0, chip_us: float = 100.0, **soft: Any) -> DecodedFrame:
+def decoded_frame(
+    t_us: float, packet: int = 0, frame: int = 0, chip_us: float = 100.0, **soft: Any
+) -> DecodedFrame:
     given = {"symbols": np.array([65]), "llr": np.ones((1, 8), np.float32), "quality": 0.9}
     return DecodedFrame(packet, frame, t_us, t_us, chip_us, SoftSymbols(**given | soft))
 
@@ -56,7 +58,7 @@ class Steps:
         return self.given
 
 
-def at(state: int, *found: Any) -> Any:
+def step_result(state: int, *found: Any) -> Any:
     return state + 1, list(found)
 
 
@@ -96,7 +98,7 @@ class Late(NoData):
     """Fails at the first frame."""
 
 
-def made(base: type, **methods: Any) -> Any:
+def make_algorithm(base: type, **methods: Any) -> Any:
     return dataclass(frozen=True)(type("Broken", (base,), methods | {"__doc__": "Broken."}))
 
 
@@ -106,11 +108,16 @@ def steps(gives: Callable[[int], Any], counts: Any = None) -> Callable[..., Step
 
 def frames(*faults: dict[str, Any]) -> Any:
     """A framing that gives frames, each with something wrong."""
-    return made(Uart, compile=steps(lambda n: at(n, *(heard(**({"t_us": n} | fault)) for fault in faults))))
+    return make_algorithm(
+        Uart,
+        compile=steps(
+            lambda n: step_result(n, *(decoded_frame(**({"t_us": n} | fault)) for fault in faults))
+        ),
+    )
 
 
 def words(given: Any) -> Any:
-    return made(Modulation, codewords=lambda _: given)
+    return make_algorithm(Modulation, codewords=lambda _: given)
 
 
 NAN = float("nan")
@@ -123,21 +130,32 @@ COMPILES: dict[str, tuple[Callable[..., Any], str]] = {
     "gives nothing": (steps(lambda n: None), "gave NoneType at step(), expected the state and a list"),
     "gives five": (steps(lambda n: (n, 5)), "gave int, expected list"),
 }
-FIVES = steps(lambda n: at(n, 5))
+FIVES = steps(lambda n: step_result(n, 5))
 CHIPS = "codebook codewords: expected a 2-D array of chips 0 and 1"
 CASES: dict[tuple[str, str], tuple[Any, str]] = {
-    **{("framing", name): (made(Uart, compile=how), says) for name, (how, says) in COMPILES.items()},
-    **{("detection", name): (made(Detection, compile=how), says) for name, (how, says) in COMPILES.items()},
-    ("framing", "gives fives"): (made(Uart, compile=FIVES), "gave int, expected DecodedFrame"),
-    ("detection", "gives fives"): (made(Detection, compile=FIVES), "gave int, expected Region"),
+    **{
+        ("framing", name): (make_algorithm(Uart, compile=how), says) for name, (how, says) in COMPILES.items()
+    },
+    **{
+        ("detection", name): (make_algorithm(Detection, compile=how), says)
+        for name, (how, says) in COMPILES.items()
+    },
+    ("framing", "gives fives"): (make_algorithm(Uart, compile=FIVES), "gave int, expected DecodedFrame"),
+    ("detection", "gives fives"): (make_algorithm(Detection, compile=FIVES), "gave int, expected Region"),
     ("framing", "time is NaN"): (frames({"t_us": NAN}), "gave t_us = nan, expected a number from "),
     ("framing", "LLR is NaN"): (frames({"llr": np.full((1, 8), NAN)}), "gave llr of other values, expected"),
     ("framing", "symbol is none"): (frames({"symbols": np.array([256])}), "gave symbol 256, expected"),
     ("framing", "frame is none"): (frames({"frame": 20}), "gave frame = 20, expected a number from 0 to 19"),
     ("framing", "goes back"): (frames({"packet": 3}, {"packet": 1}), "gave frame 0 of packet 1 behind"),
-    ("framing", "counts five"): (made(Uart, compile=steps(at, 5)), "gave int, expected Mapping"),
-    ("framing", "book fails"): (made(Uart, codebook=boom), "KeyError: 'boom'; "),
-    ("framing", "book is five"): (made(Uart, codebook=lambda *_: 5), "TypeError: gave int at codebook(),"),
+    ("framing", "counts five"): (
+        make_algorithm(Uart, compile=steps(step_result, 5)),
+        "gave int, expected Mapping",
+    ),
+    ("framing", "book fails"): (make_algorithm(Uart, codebook=boom), "KeyError: 'boom'; "),
+    ("framing", "book is five"): (
+        make_algorithm(Uart, codebook=lambda *_: 5),
+        "TypeError: gave int at codebook(),",
+    ),
     ("modulation", "words are alike"): (words(np.repeat(LONE, 2, 0)), "codebook codewords: rows 0 and 1"),
     ("modulation", "one word"): (words(LONE), "ValueError: gave 1 codeword, expected two or more; "),
     ("pilots", "odd"): (OddPilots, "codebook preamble: expected a 1-D array of chips 0 and 1"),
@@ -145,7 +163,10 @@ CASES: dict[tuple[str, str], tuple[Any, str]] = {
     ("ranging", "no data"): (NoData, "TypeError: "),
     ("ranging", "refuses"): (Refuses, "KeyError: 'boom'; "),
     ("ranging", "late"): (Late, "KeyError: 'boom' (test_broken_algorithms.py, line "),
-    ("tracking", "nothing"): (made(Tracking, compile=lambda self: None), "gave NoneType, expected Tracker; "),
+    ("tracking", "nothing"): (
+        make_algorithm(Tracking, compile=lambda self: None),
+        "gave NoneType, expected Tracker; ",
+    ),
 }
 for (_role, _id), (_class, _) in CASES.items():
     globals()[f"{_role} {_id}"] = _class
@@ -196,10 +217,10 @@ def test_what_was_received_before_it_failed_is_kept(lamp_raw: Path, tmp_path: Pa
     """Packets that were given before the fault are in the files, whose summary says why they end."""
 
     def gives(n: int) -> Any:
-        return at(n, heard(float(n), packet=n - 8)) if n < 40 else boom()
+        return step_result(n, decoded_frame(float(n), packet=n - 8)) if n < 40 else boom()
 
     link = resolve({"bar": LAMP, "air": AIR, "framing": {"id": "uart"}, "detection": {"id": "whole"}})
-    link = link.with_algorithm("framing", made(Uart, compile=lambda *_: Steps(gives))(), id="mine")
+    link = link.with_algorithm("framing", make_algorithm(Uart, compile=lambda *_: Steps(gives))(), id="mine")
     says = "framing algorithm 'mine': KeyError: 'boom'"
     with pytest.raises(PluginError, match=says):
         receive_to_folder(lamp_raw, tmp_path / "out", link)

@@ -32,7 +32,7 @@ def link_with(layout, *overrides):
     return load_link(overrides=[*LAYOUTS[layout], *overrides])
 
 
-def compiled(link):
+def compile_link(link):
     return link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
 
 
@@ -43,7 +43,7 @@ def test_a_link_that_names_no_ranging_measures_its_bar(layout):
     beside = {"1 clusters": "none", "2 clusters": "none", "one row of two": "none", "not alike": "centroid"}
     wanted = beside.get(layout, "poc" if layout in ("ring", "three LEDs", "two lamps") else "joint-scale")
     assert link.table["ranging"]["id"] == wanted
-    compiled(link)
+    compile_link(link)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -51,7 +51,7 @@ def test_a_link_that_names_no_ranging_measures_its_bar(layout):
 def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name, layout):
     link = link_with(layout, f"ranging.id={name}")
     try:
-        measure = compiled(link)
+        measure = compile_link(link)
     except ConfigError as refused:
         reported = str(refused)
         settings = [
@@ -59,7 +59,7 @@ def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name, lay
         ]
         other = re.search(r"use '([\w-]+)' for this layout", reported)
         if settings or other:
-            compiled(link_with(layout, *settings, f"ranging.id={other[1] if other else name}"))
+            compile_link(link_with(layout, *settings, f"ranging.id={other[1] if other else name}"))
         else:
             assert "expected at least min_clusters" in reported
         return
@@ -78,4 +78,4 @@ def test_joint_scale_refuses_pilots_of_other_codes():
         "16 clusters", "modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed", "ranging.id=joint-scale"
     )
     with pytest.raises(ConfigError, match=r"the pilots are others; try ranging\.id = 'poc'"):
-        compiled(link)
+        compile_link(link)

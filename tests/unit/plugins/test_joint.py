@@ -69,7 +69,7 @@ def view_of(
     return FrameView(chips.astype(np.int16), offset, map_of(selected, chips), soft)
 
 
-def measured(view, **parameters):
+def measure(view, **parameters):
     return JointScaleRanging(**parameters).compile(LINK.camera, LINK.bar, LINK.codebook)(view)
 
 
@@ -88,7 +88,7 @@ def measured(view, **parameters):
     ids=str,
 )
 def test_it_stands_tilt_motion_and_damage(how):
-    found = measured(view_of(50.0, **how))
+    found = measure(view_of(50.0, **how))
     assert found.distance_m == pytest.approx(50, rel=4e-3)
     assert found.pairs == (13 if "dark" in how else 15)
 
@@ -101,7 +101,7 @@ def test_unknown_symbols_leave_the_pilot_of_their_clusters():
         # Guessed at, they would be left out or bend the fit.
         unknown[some], guess[some] = -1, (guess[some] + 1) % 64
         found, guessed = (
-            measured(replace(view, soft=replace(view.soft, symbols=symbols))) for symbols in (unknown, guess)
+            measure(replace(view, soft=replace(view.soft, symbols=symbols))) for symbols in (unknown, guess)
         )
         assert found.distance_m == pytest.approx(50, rel=4e-3)
         assert found.pairs == 15
@@ -116,7 +116,7 @@ def test_values_that_the_fit_does_not_explain_give_no_distance(shift):
     sums = np.roll(view.sums, shift, 1)
     if not shift:
         sums = np.random.default_rng(3).integers(-3, 4, view.sums.shape).astype(np.int16)
-    found = measured(replace(view, sums=sums))
+    found = measure(replace(view, sums=sums))
     assert np.isnan(found.distance_m)
     assert found.pairs == 0
 
@@ -125,7 +125,7 @@ def test_sigma_is_the_spread():
     errors = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        found = measured(view_of(60.0, noise=1.5, seed=seed, shift_px=rng.uniform(-0.5, 0.5)))
+        found = measure(view_of(60.0, noise=1.5, seed=seed, shift_px=rng.uniform(-0.5, 0.5)))
         errors.append((found.distance_m - 60) / found.sigma_m)
     # 60 draws tell a spread to a tenth; the rest is for pixel phases, which repeat.
     assert 0.6 < np.std(errors) < 1.5

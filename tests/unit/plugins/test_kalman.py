@@ -42,7 +42,7 @@ def position_errors(measured, true, **parameters):
     return np.array(out)
 
 
-def shaken(n, jolt_px_s=0.0):
+def shaking_camera(n, jolt_px_s=0.0):
     """A bar's centre on a shaking camera, whose speed changes at once in the middle."""
     t = 1.5e-3 * np.arange(n)
     after = np.maximum(t - t[n // 2], 0)
@@ -52,7 +52,7 @@ def shaken(n, jolt_px_s=0.0):
 
 @pytest.mark.parametrize("jolt_px_s", [-7000.0, 3000.0, 7000.0])
 def test_a_pothole_is_followed(jolt_px_s):
-    true = shaken(120, jolt_px_s)
+    true = shaking_camera(120, jolt_px_s)
     measured = true + np.random.default_rng(3).normal(0, 0.25, true.shape)
     errors = position_errors(measured, true)
     assert errors[:, 0].max() < 1.5
@@ -63,7 +63,7 @@ def test_a_pothole_is_followed(jolt_px_s):
 
 
 def test_a_stray_position_is_no_jolt():
-    true = shaken(120)
+    true = shaking_camera(120)
     measured = true + np.random.default_rng(4).normal(0, 0.25, true.shape)
     measured[50] += (60.0, 0.0)
     errors = position_errors(measured, true)

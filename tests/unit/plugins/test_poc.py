@@ -45,7 +45,7 @@ def band_limited(rng, height, width):
     return spectrum
 
 
-def shifted(spectrum, shape, down, right):
+def shift_spectrum(spectrum, shape, down, right):
     v = np.fft.fftfreq(shape[0])[:, None]
     u = np.fft.rfftfreq(shape[1])
     return np.fft.irfft2(spectrum * np.exp(-2j * np.pi * (down * v + right * u)), shape).astype(np.float32)
@@ -118,7 +118,7 @@ def test_exact_shifts_are_recovered(samples, shape, most):
     rng = np.random.default_rng(samples)
     spectrum = band_limited(rng, *shape)
     by = np.array([[0, 0], *rng.uniform(-4, 4, (3, 2)), [1, -2], [0.5, -0.5]])
-    images = np.stack([shifted(spectrum, shape, *d) for d in by], axis=1)
+    images = np.stack([shift_spectrum(spectrum, shape, *d) for d in by], axis=1)
     first, second = np.triu_indices(len(by), 1)
     near = np.abs(by[second] - by[first]).max(1) < 5
     pairs, band = (first[near], second[near]), most or full_band(*shape)
@@ -165,7 +165,7 @@ def image_of(bar, distance_m, *, tilt_deg=0.0, blob="gaussian", offset=(0.2, -0.
     return np.where(maps > 1e-4 * maps.max(), maps / maps.max(), 0)
 
 
-def measured(maps, bar=BAR, **parameters):
+def measure(maps, bar=BAR, **parameters):
     return PocRanging(**parameters).compile(CAMERA, bar, LINK.codebook)(view_of(maps))
 
 
@@ -196,16 +196,16 @@ def test_distance_of_ideal_images(bar, blob, tolerance, tilt_deg, band):
 def test_a_distance_needs_its_pairs(dark, pairs):
     maps = image_of(BAR, 50)
     maps[list(dark)] = 0
-    assert measured(maps, min_pairs=1, drop_extremes=0, outlier_iqr=1e6).pairs == pairs
-    assert np.isnan(measured(maps).distance_m) == (pairs < 7)
+    assert measure(maps, min_pairs=1, drop_extremes=0, outlier_iqr=1e6).pairs == pairs
+    assert np.isnan(measure(maps).distance_m) == (pairs < 7)
 
 
 @pytest.mark.parametrize("cluster", [2, 5, 12])
 @pytest.mark.parametrize("down", [3, -3])
 def test_a_cluster_out_of_place_is_dropped(cluster, down):
     maps = image_of(BAR, 50, moved={cluster: (0, down)})
-    found = measured(maps)
-    everything = measured(maps, drop_extremes=0, outlier_iqr=1e6)
+    found = measure(maps)
+    everything = measure(maps, drop_extremes=0, outlier_iqr=1e6)
     assert found.distance_m == pytest.approx(50, rel=1.5e-3)
     assert abs(everything.distance_m / 50 - 1) > 2.5e-3
     assert everything.sigma_m > 2 * found.sigma_m
@@ -217,7 +217,7 @@ def test_a_cluster_out_of_place_is_dropped(cluster, down):
 def test_sigma_is_the_error_that_noise_makes():
     rng, maps = np.random.default_rng(8), image_of(BAR, 70)
     noisy = (np.clip(maps + rng.normal(0, 0.1, maps.shape), 0, 1) * (maps > 0) for _ in range(60))
-    distance_m, sigma_m = np.array([(r.distance_m, r.sigma_m) for r in map(measured, noisy)]).T
+    distance_m, sigma_m = np.array([(r.distance_m, r.sigma_m) for r in map(measure, noisy)]).T
     assert 0.5 < sigma_m.mean() / distance_m.std() < 2
 
 

@@ -35,7 +35,7 @@ def single_nodes(information):
     return np.stack([np.arange(n), np.zeros(n, np.int64), information], 1).astype(np.int64)
 
 
-def decoded(llr, nodes, size, limit=np.inf):
+def decode_nodes(llr, nodes, size, limit=np.inf):
     codewords, metric = np.empty((size, len(llr)), np.uint8), np.empty(size)
     found = _kernels.list_decode(llr, nodes, size, limit, codewords, metric)
     order = np.argsort(metric[:found])
@@ -46,7 +46,7 @@ def discrepancy(llr, codewords):
     return (np.abs(llr) * ((llr < 0) != codewords)).sum(-1).astype(float)
 
 
-def received(coded, bit_error_rate, rng):
+def transmit(coded, bit_error_rate, rng):
     """LLRs of an AWGN channel with a hard-decision error rate."""
     sigma = -1 / stats.norm.ppf(bit_error_rate)
     return (2 * (1.0 - 2.0 * coded + sigma * rng.normal(size=len(coded))) / sigma**2).astype(np.float32)
@@ -144,7 +144,7 @@ def test_list_decoding_against_its_twin(n, k, size):
             llr = rng.normal(mean, 1.0, n).astype(np.float32)
             wanted = twin(llr.astype(float), information, size)
             for nodes in (list_nodes(information), single_nodes(information)):
-                codewords, metric = decoded(llr, nodes, size)
+                codewords, metric = decode_nodes(llr, nodes, size)
                 assert_allclose(metric, [m for m, _ in wanted], rtol=1e-4, atol=1e-5)
                 assert_array_equal(codewords, [c for _, c in wanted])
 
@@ -159,7 +159,7 @@ def test_shortened_and_punctured_codes_against_brute_force(length, rate):
     rng = np.random.default_rng(length)
     decided = 0
     for i in range(150):
-        llr = received(codewords[i], 0.06 if rate > 0.5 else 0.12, rng)
+        llr = transmit(codewords[i], 0.06 if rate > 0.5 else 0.12, rng)
         llr[rng.integers(length)] = 0
         found = code.decode(llr)
         likely = int(discrepancy(llr, codewords).argmin())
@@ -215,7 +215,7 @@ def test_a_scale_of_the_llrs_changes_nothing():
     code = Polar().compile(256)
     rng = np.random.default_rng(0)
     message = rng.integers(0, 2, 104).astype(np.uint8)
-    llr = received(code.encode(message), 0.05, rng)
+    llr = transmit(code.encode(message), 0.05, rng)
     for scale in (1e-20, 1.0, 1e20):
         found = code.decode(llr * np.float32(scale))
         assert found.ok
@@ -231,6 +231,6 @@ def test_no_message_is_lost_where_the_link_works(length, blocks, bit_error_rate)
     code, rng = Polar().compile(length), np.random.default_rng(0)
     for _ in range(blocks):
         message = rng.integers(0, 2, code.message_bits).astype(np.uint8)
-        found = code.decode(received(code.encode(message), bit_error_rate, rng))
+        found = code.decode(transmit(code.encode(message), bit_error_rate, rng))
         assert found.ok
         assert_array_equal(found.bits, message)

@@ -22,14 +22,14 @@ def product(a, b):
     return found
 
 
-def at(polynomial, x):
+def evaluate(polynomial, x):
     value = 0
     for coefficient in polynomial.tolist():
         value = product(value, x) ^ coefficient
     return value
 
 
-def coded(length=960, seed=0, **parameters):
+def coded_message(length=960, seed=0, **parameters):
     """A code, a message, its coded bits, and where the bytes of each codeword are, data and parity."""
     code = ReedSolomon(**parameters).compile(length)
     message = np.random.default_rng(seed).integers(0, 2, code.message_bits).astype(np.uint8)
@@ -45,7 +45,7 @@ def llr_of(bits):
 
 @pytest.mark.parametrize(("length", "rate"), [(256, 0.5), (960, 0.5), (2040, 0.5), (2048, 0.8), (4100, 0.3)])
 def test_every_codeword_has_the_roots_of_the_generator(length, rate):
-    code, message, sent, places = coded(length, rate=rate)
+    code, message, sent, places = coded_message(length, rate=rate)
     data = code.message_bits // 8 + 3
     assert_array_equal(sent[: 8 * data], [*message, *crc24(message)])
     assert data / (length // 8) <= rate < (data + len(places)) / (length // 8)
@@ -54,7 +54,7 @@ def test_every_codeword_has_the_roots_of_the_generator(length, rate):
         assert len(word) <= 255
         root = 1
         for _ in parity:
-            assert at(word, root) == 0
+            assert evaluate(word, root) == 0
             root = product(root, 2)
 
 
@@ -63,7 +63,7 @@ def test_half_the_parity_in_wrong_bytes(length):
     """As many wrong bytes in each codeword as half its parity, as sure as the others; one more is lost."""
     rng = np.random.default_rng(1)
     for extra in (0, 1):
-        code, message, sent, places = coded(length, extra)
+        code, message, sent, places = coded_message(length, extra)
         received = np.packbits(sent)
         for own, parity in places:
             wrong = rng.choice(np.concatenate([own, parity]), len(parity) // 2 + extra, replace=False)
@@ -77,7 +77,7 @@ def test_half_the_parity_in_wrong_bytes(length):
 
 
 def test_bytes_that_were_not_received_or_are_unsure():
-    code, message, sent, _ = coded()
+    code, message, sent, _ = coded_message()
     rng = np.random.default_rng(2)
     for count, ok in ((52, True), (53, False)):
         llr = llr_of(sent).reshape(120, 8)
@@ -92,7 +92,7 @@ def test_bytes_that_were_not_received_or_are_unsure():
 
 def test_what_is_no_number_says_nothing():
     """As with `polar`: 40 bytes that are NaN are erased; as received ones they are too many to correct."""
-    code, message, sent, _ = coded()
+    code, message, sent, _ = coded_message()
     places = np.random.default_rng(2).permutation(120)
     llr = llr_of(sent).reshape(120, 8)
     llr[places[40:48]] *= -1

@@ -85,7 +85,7 @@ def test_there_is_no_light_in_noise_or_in_what_moves():
     assert not any(regions for _, regions in regions_of(link_of(500.0), noise, 0.2))
 
 
-def moved(events, right, share, late_us, rng):
+def move_events(events, right, share, late_us, rng):
     """Some of the events elsewhere and later, as a lens scatters light and dim pixels see it."""
     kept = rng.random(len(events)) < share
     t = events.t_us[kept] + late_us + rng.integers(0, 40, int(kept.sum()))
@@ -111,7 +111,7 @@ def test_what_the_lens_scatters_is_no_light_and_a_dim_one_beside_is(rate_hz, lat
     bright = events_of(rng, rate_hz, seconds, 90, 0.0)
     dim = events_of(rng, rate_hz, seconds, 28, 0.0)
     noise = events_of(rng, rate_hz, seconds, 1, 10_000.0)
-    flare, dim = moved(bright, -70, 0.3, late_us, rng), moved(dim, 60, 1.0, late_us, rng)
+    flare, dim = move_events(bright, -70, 0.3, late_us, rng), move_events(dim, 60, 1.0, late_us, rng)
     found = regions_of(link_of(rate_hz), merged(bright, flare, dim, noise), seconds)
     half_us = int(seconds * 5e5)
     assert places_of(found, half_us, 0) == 1

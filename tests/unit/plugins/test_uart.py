@@ -37,7 +37,7 @@ def levels_of(values, data_bits, parity, stop_bits, highest_first=False):
     return out
 
 
-def seen(
+def light_of_bytes(
     rng,
     levels,
     bit_us,
@@ -90,7 +90,7 @@ def test_bright_light_is_read_without_an_error(bit_hz, clock, mark_on, late_us):
     sent = rng.integers(0, 128, 60)
     bit_us = 1e6 / bit_hz * (1 + clock)
     how = {"mark_on": mark_on, "late_us": late_us, "noise_hz": bit_hz / 10, "cut_bits": 4.4}
-    events = seen(rng, levels_of(sent, 7, "even", 2), bit_us, **how)
+    events = light_of_bytes(rng, levels_of(sent, 7, "even", 2), bit_us, **how)
     uart = Uart(7, "even", 2, idle="on" if mark_on else "off")
     found = read_characters(events.t_us, events.p, bit_hz, uart)
     # The first one is cut.
@@ -113,7 +113,9 @@ def test_bright_light_is_read_without_an_error(bit_hz, clock, mark_on, late_us):
 def test_a_list_is_read_from_its_first_character_wherever_time_begins(seed, first_us, text):
     levels = levels_of(np.frombuffer(text, np.uint8), 7, "even", 2)
     # Edges are seen late, so the first character begins before the first event.
-    events = seen(np.random.default_rng(seed), levels, BIT_504_US, late_us=(60.0, 400.0), noise_hz=0.0)
+    events = light_of_bytes(
+        np.random.default_rng(seed), levels, BIT_504_US, late_us=(60.0, 400.0), noise_hz=0.0
+    )
     t_us = events.t_us - events.t_us[0] + first_us
     found = read_characters(t_us, events.p, 504.0, Uart(7, "even", 2))
     # The rest of the last one's bits may not have been seen.
@@ -135,7 +137,7 @@ def test_times_that_are_coarse_are_read(rate_hz, events, late_us, grain_us):
     sent = np.random.default_rng(1).integers(0, 128, 60)
     bit_us = 1e6 / rate_hz * 1.002
     rng, levels = np.random.default_rng(9), levels_of(sent, 7, "even", 2)
-    light = seen(rng, levels, bit_us, events=events, late_us=late_us)
+    light = light_of_bytes(rng, levels, bit_us, events=events, late_us=late_us)
     t_us, p = (light.t_us // grain_us + 1) * grain_us, light.p
     found = read_characters(t_us, p, rate_hz, Uart(7, "even", 2))
     starts = 20_000 + 11 * bit_us * np.arange(len(sent))
@@ -155,7 +157,7 @@ def test_a_stream_that_begins_within_a_character_gives_none_that_was_not_sent(cu
     for k, value in enumerate(sent.tolist()):
         starts.append(len(levels))
         levels += levels_of(np.array([value]), 8, "even", 1) + [1] * (pause if k % 5 == 1 else 0)
-    events = seen(rng, levels, bit_us, late_us=(20.0, 30.0), noise_hz=0.0, start_us=0.0)
+    events = light_of_bytes(rng, levels, bit_us, late_us=(20.0, 30.0), noise_hz=0.0, start_us=0.0)
     later = events.t_us >= cut * bit_us
     decoder = Uart(8, "even", 1).decoder(1e6 / bit_us)
     until_us = int(events.t_us[-1] + 3 * pause * bit_us)
@@ -177,7 +179,7 @@ def test_the_pause_tells_characters_of_a_recording_that_begins_within_a_packet()
     # From the last data bit of the 35 on.
     cut_bits = 16 + 3 * 11 + 8.7
     dim = {"events": (20.0, 15.0), "late_us": (20.0, 10.0), "noise_hz": 0.0}
-    events = seen(np.random.default_rng(0), levels, 100.0, cut_bits=cut_bits, **dim)
+    events = light_of_bytes(np.random.default_rng(0), levels, 100.0, cut_bits=cut_bits, **dim)
     for pause_bits in (16, 9):
         found = read_characters(events.t_us, events.p, 1e4, Uart(8, "even", 1, pause_bits=pause_bits))
         read = [c.value for c in found]
@@ -191,7 +193,7 @@ def dim(events, unseen, many):
     """Characters that were sent by a dim light, and those that are read."""
     rng = np.random.default_rng(17)
     sent = rng.integers(0, 128, many)
-    light = seen(rng, levels_of(sent, 7, "even", 2), DIM_BIT_US, events=events, unseen=unseen)
+    light = light_of_bytes(rng, levels_of(sent, 7, "even", 2), DIM_BIT_US, events=events, unseen=unseen)
     return sent, read_characters(light.t_us, light.p, 3125.0, Uart(7, "even", 2))
 
 
@@ -268,7 +270,7 @@ def test_a_text_comes_through_the_receiver_in_any_pieces():
     link = _link()
     symbols = compose(link, text="Works ahead", transmitter_id=7, sequence=3)
     chips = np.concatenate([packet_chips(one, link.codebook)[:, 0] for one in symbols] * 2)
-    events = seen(np.random.default_rng(1), chips.tolist(), 323.0)
+    events = light_of_bytes(np.random.default_rng(1), chips.tolist(), 323.0)
     packets, counts = _received(link, events, 4000)
     (message,) = [m for p in packets for m in p.messages]
     assert message.value == "Works ahead"
@@ -289,7 +291,9 @@ def test_packets_behind_another_pause_than_is_stated_are_whole(extra):
     sent = rng.integers(0, 128, (6, 100, 1))
     stated = len(link.codebook.preamble)
     levels = [packet_chips(one, link.codebook)[stated:, 0].tolist() for one in sent]
-    events = seen(rng, [v for one in levels for v in [*[1] * (stated + extra), *one]], 320.0 * (1 + 1e-3))
+    events = light_of_bytes(
+        rng, [v for one in levels for v in [*[1] * (stated + extra), *one]], 320.0 * (1 + 1e-3)
+    )
     packets, _ = _received(link, events, 4000)
     assert [(p.packet, [int(f.soft.symbols[0]) for f in p.frames]) for p in packets] == [
         (n, one[:, 0].tolist()) for n, one in enumerate(sent)
@@ -305,7 +309,7 @@ def test_a_long_pause_has_no_characters():
     rng = np.random.default_rng(1)
     first, second = rng.integers(0, 128, (2, 60))
     words = [levels_of(one, 7, "even", 2) for one in (first, second)]
-    events = seen(rng, [*words[0], *[1] * 6000, *words[1]], 320.0)
+    events = light_of_bytes(rng, [*words[0], *[1] * 6000, *words[1]], 320.0)
     found = read_characters(events.t_us, events.p, 3125.0, Uart(7, "even", 2))
     assert [c.value for c in found] == [*first, *second]
 
@@ -315,7 +319,7 @@ def test_a_bar_of_clusters_is_refused():
         resolve({"framing": {"id": "uart"}})
 
 
-def received(evlcp, folder, events, query="", **framing):
+def receive_list(evlcp, folder, events, query="", **framing):
     """What `receive` prints of a list of times and polarities, and its summary."""
     rows = "".join(f"{t},{p}\n" for t, p in zip(events.t_us.tolist(), events.p.tolist(), strict=True))
     (folder / "list.csv").write_text("t,p\n" + rows)
@@ -334,15 +338,15 @@ def test_text_is_given_as_it_is_read(tmp_path, evlcp):
     """The highest bit first; and what is said where it is not told."""
     text = "Rough winds do shake the darling buds of May, " * 3
     levels = levels_of(np.frombuffer(text.encode(), np.uint8), 7, "even", 2, True)
-    events = seen(np.random.default_rng(2), levels, 320.0)
-    printed, summary = received(evlcp, tmp_path, events, first_bit="highest", **SEVEN_EVEN)
+    events = light_of_bytes(np.random.default_rng(2), levels, 320.0)
+    printed, summary = receive_list(evlcp, tmp_path, events, first_bit="highest", **SEVEN_EVEN)
     assert "text of 0: 'Rough winds do shake" in printed
     lines = [json.loads(line) for line in (tmp_path / "out" / "packets.jsonl").read_text().splitlines()]
     # Of the last packet only the first characters were sent.
     assert "".join(line["text"] for line in lines).rstrip("\ufffd") == text
     assert [one["text"] for one in summary["transmitters"]] == [text]
     assert summary["warnings"] == []
-    _, summary = received(evlcp, tmp_path, events, **SEVEN_EVEN)
+    _, summary = receive_list(evlcp, tmp_path, events, **SEVEN_EVEN)
     assert [one["code"] for one in summary["warnings"]] == ["bit-order"]
 
 
@@ -361,7 +365,7 @@ def test_a_light_the_other_way_round_is_read(data_bits, parity, stop_bits, bit_h
     bit_us = 1e6 / bit_hz
     levels = levels_of(sent, data_bits, parity, stop_bits)
     assert Uart(data_bits, parity, stop_bits).codebook(1).codewords[sent].ravel().tolist() == levels
-    events = seen(rng, levels, bit_us, mark_on=mark_on, late_us=(40.0, 60.0), noise_hz=50.0)
+    events = light_of_bytes(rng, levels, bit_us, mark_on=mark_on, late_us=(40.0, 60.0), noise_hz=50.0)
     decoder = Uart(data_bits, parity, stop_bits, idle=idle).decoder(bit_hz)
     state, found = decoder.step(decoder.init(), events.t_us, events.p, int(events.t_us[-1]))
     state, more = decoder.close(state)
@@ -378,7 +382,7 @@ def test_a_text_is_read_from_its_first_stretch_on_whatever_the_clock(clock):
     rng = np.random.default_rng(1001)
     rng.integers(0, 500)
     bit_us, cut = 320 * (1 + clock), float(rng.uniform(0, 11))
-    light = seen(rng, levels, bit_us, events=(14.0, 11.0), unseen=0.001, cut_bits=cut)
+    light = light_of_bytes(rng, levels, bit_us, events=(14.0, 11.0), unseen=0.001, cut_bits=cut)
     found = read_characters(light.t_us, light.p, 3125.0, Uart(7, "even", 2, first_bit="highest"))
     assert found[0].bit_us == pytest.approx(bit_us, rel=1e-3)
     assert wrong_bits([one.value for one in found[-98:]], sent[-98:].tolist(), 7) < 0.01
@@ -387,10 +391,10 @@ def test_a_text_is_read_from_its_first_stretch_on_whatever_the_clock(clock):
 def test_what_a_list_has_wrong_is_reported(tmp_path, evlcp):
     """Polarities that are turned, or of one kind alone; and what the list did not say."""
     sent = np.random.default_rng(4).integers(0, 128, 60)
-    events = seen(np.random.default_rng(3), levels_of(sent, 7, "even", 2), 320.0)
+    events = light_of_bytes(np.random.default_rng(3), levels_of(sent, 7, "even", 2), 320.0)
 
     def told(kept, query=""):
-        return received(evlcp, tmp_path, kept, query, **SEVEN_EVEN)[1]
+        return receive_list(evlcp, tmp_path, kept, query, **SEVEN_EVEN)[1]
 
     turned = Events.of(events.t_us, events.x, events.y, 1 - events.p)
     inverted = told(turned)
@@ -409,7 +413,9 @@ def test_a_lamp_that_reads_as_one_character_is_reported(tmp_path, evlcp):
     """A period of ten bits, half of it dark: 8N1 reads 0xF0 for ever. A text with blanks is none."""
 
     def warnings_of(levels):
-        return received(evlcp, tmp_path, seen(np.random.default_rng(3), levels, 320.0))[1]["warnings"]
+        return receive_list(evlcp, tmp_path, light_of_bytes(np.random.default_rng(3), levels, 320.0))[1][
+            "warnings"
+        ]
 
     lamp = warnings_of([1, *[0, 0, 0, 0, 0, 1, 1, 1, 1, 1] * 120])
     (reported,) = (one["text"] for one in lamp if one["code"] == "one-character")
@@ -431,7 +437,7 @@ def test_rate_and_format_of_a_light_are_found(data_bits, parity, stop_bits, bit_
     rng = np.random.default_rng(2)
     levels = levels_of(rng.integers(0, 1 << data_bits, 90), data_bits, parity, stop_bits)
     light = {"mark_on": mark_on, "noise_hz": bit_hz / 10, "start_us": 2e6} | light
-    events = seen(rng, levels, 1e6 / bit_hz / (1 + clock), **light)
+    events = light_of_bytes(rng, levels, 1e6 / bit_hz / (1 + clock), **light)
     found, _ = infer(events.t_us, events.p)
     assert found.pop("air.chip_rate_hz") == pytest.approx(bit_hz * (1 + clock), rel=1e-3)
     assert found.pop("framing.first_bit") == "lowest"
@@ -452,7 +458,7 @@ def light_of(kind):
         "a pattern": np.tile(bits[:37], 40),
         "no light": np.ones(1600, np.int64),
     }[kind]
-    return seen(rng, levels.tolist(), 250.0, late_us=(40.0, 60.0))
+    return light_of_bytes(rng, levels.tolist(), 250.0, late_us=(40.0, 60.0))
 
 
 @pytest.mark.parametrize("kind", ["random bits", "pair codes", "a lamp", "PWM", "a pattern", "no light"])
@@ -467,7 +473,7 @@ def test_a_list_is_received_without_a_link(tmp_path, evlcp):
     text = "Rough winds do shake the darling buds of May, " * 3
     codes = np.frombuffer(text.encode(), np.uint8).astype(int)
     turned = np.array([int(f"{code:07b}"[::-1], 2) for code in codes.tolist()])
-    light = seen(np.random.default_rng(2), levels_of(turned, 7, "even", 2), 320.0)
+    light = light_of_bytes(np.random.default_rng(2), levels_of(turned, 7, "even", 2), 320.0)
     np.savez(tmp_path / "light.npz", t_us=light.t_us, p=light.p)
     run = evlcp("receive", tmp_path / "light.npz", "-o", tmp_path / "out", "--link", "auto")
     assert "3125 baud, 7 data bits highest first, even parity, 2 stop bits: 7E2, idle on, 13" in run.err
@@ -481,7 +487,7 @@ def test_pair_codes_without_a_parity_to_fail_are_none_of_characters(seed):
     rng = np.random.default_rng(seed)
     values = rng.integers(0, 2, 260)
     levels = np.stack([values, 1 - values], 1).ravel().tolist()
-    light = seen(rng, levels, 100.0, late_us=(20.0, 30.0), noise_hz=100.0)
+    light = light_of_bytes(rng, levels, 100.0, late_us=(20.0, 30.0), noise_hz=100.0)
     assert read_characters(light.t_us, light.p, 10_000.0, Uart(8, "none", 1)) == []
 
 

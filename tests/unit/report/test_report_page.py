@@ -55,14 +55,14 @@ def result(demo_raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def held(page: str) -> dict[str, Any]:
+def plots_of(page: str) -> dict[str, Any]:
     """What the page's script reads."""
     plots, report = map(json.loads, Elements(page).scripts[:2])
     return {"plots": plots} | report
 
 
 @contextmanager
-def reported(folder: Path, name: str = "a.raw", **summary: Any) -> Iterator[Report]:
+def open_report(folder: Path, name: str = "a.raw", **summary: Any) -> Iterator[Report]:
     with ResultFolder(folder, ["report.html"]) as files:
         sink = Report(files, Run(name, LINK))
         yield sink
@@ -72,7 +72,7 @@ def reported(folder: Path, name: str = "a.raw", **summary: Any) -> Iterator[Repo
 
 def test_numbers_are_those_of_the_files(result: Path) -> None:
     page = (result / "report.html").read_text()
-    given, output = rows_of(result / "frames.csv"), held(page)["plots"]
+    given, output = rows_of(result / "frames.csv"), plots_of(page)["plots"]
     assert len(given) == 21
     body = re.findall(r"<tr><td>(\d+)/(\d+)</td>(.*?)</tr>", page, re.DOTALL)
     dots = [text for _, _, text, _ in output["distance-0"]]
@@ -102,7 +102,7 @@ def test_numbers_are_those_of_the_files(result: Path) -> None:
 
 
 def test_the_slow_motion_is_what_was_sent(result: Path) -> None:
-    (first,) = held((result / "report.html").read_text())["motions"]
+    (first,) = plots_of((result / "report.html").read_text())["motions"]
     named = "transmitter {transmitter}, packet {packet}, frame {frame}"
     (row,) = [one for one in rows_of(result / "frames.csv") if named.format(**one) == first["name"]]
     symbols = [int(s) for s in row["symbols"].split()]
@@ -143,7 +143,7 @@ def test_a_picture_is_bounded_whatever_its_size() -> None:
 def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) -> None:
     """A long one is thinned: what is kept, and the page, do not grow."""
     soft = SoftSymbols(np.arange(16), np.zeros((16, 6), np.float32), 0.9)
-    with reported(tmp_path) as sink:
+    with open_report(tmp_path) as sink:
         for n in range(4000):
             frames = tuple(
                 Frame(n % 9, n, k, 34e3 * n + 3200 * k, soft, Range(50 - n / 100, 0.1, 9), None, 5.0, 6.0)
@@ -158,7 +158,7 @@ def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) ->
 
 
 def test_what_others_wrote_stays_text(tmp_path: Path) -> None:
-    with reported(tmp_path, HOSTILE) as sink:
+    with open_report(tmp_path, HOSTILE) as sink:
         sink._many_messages = 101
         output: Any = SimpleNamespace(
             t_us=1e3,
@@ -180,7 +180,7 @@ def test_the_map_shows_fixes_and_bars(tmp_path: Path) -> None:
         out.write(packets(13))
         recording = {"path": "a.raw", "duration_s": 0.5, "counts": {"events": 1}}
         summary = out.finish(RunEnd("complete", recording, {"times_real_time": 1.0}))
-    output = held((tmp_path / "report.html").read_text())["plots"]
+    output = plots_of((tmp_path / "report.html").read_text())["plots"]
     fixes = rows_of(tmp_path / "fixes.csv")
     assert summary["positions"]["fixes"] == len(fixes) == len(output["track"]) == len(output["map"]) - 1
     for fix, (_, _, text, _) in zip(fixes, output["track"], strict=True):
@@ -204,7 +204,7 @@ def test_nothing_found_has_a_page(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
 def test_a_browser_shows_it_wide_and_narrow_light_and_dark(result: Path, tmp_path: Path) -> None:
-    plots = held((result / "report.html").read_text())["plots"]
+    plots = plots_of((result / "report.html").read_text())["plots"]
     with Browser(tmp_path / "profile") as browser:
         for width, dark in ((1280, False), (390, True)):
             browser.dress(width, dark=dark)

@@ -19,7 +19,7 @@ def lit(packets, seed=0, link=LINK, **how):
     return bar, ideal_events(link, bar, seed=seed)
 
 
-def received(link, events, cuts=(), **options):
+def receive_cut(link, events, cuts=(), **options):
     """A receiver after a stream that is cut before these events, and its packets.
 
     What algorithms of the SDK give is checked, too, as strangers' is.
@@ -42,7 +42,7 @@ def frames_of(packets):
     return [frame for packet in packets for frame in packet.frames]
 
 
-def said(frame):
+def frame_content(frame):
     """All of a frame, to the last bit."""
     soft = frame.soft
     return (

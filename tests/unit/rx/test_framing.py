@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
-from rx_streams import LINK, frames_of, lit, noise_events, received
+from rx_streams import LINK, frames_of, lit, noise_events, receive_cut
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.alignment import polarity_sums
@@ -121,13 +121,13 @@ def read_late(events, row_us, centre_px=BAR.y_px):
     return Events.of(t_us, events.x, events.y, events.p)[np.argsort(t_us, kind="stable")]
 
 
-def measured(events, height_px=HEIGHT_PX):
+def measure(events, height_px=HEIGHT_PX):
     return measure_row_delay(PREAMBLE, BAR_LOCK, [(0, events)], BAR.y_px, height_px)
 
 
 @pytest.mark.parametrize("row_us", [-0.3, 0.0, 0.1, 0.5])
 def test_rows_that_are_read_late(row_us):
-    got, sigma = measured(read_late(EVENTS, row_us))
+    got, sigma = measure(read_late(EVENTS, row_us))
     assert got == pytest.approx(row_us, abs=max(0.01, 3 * sigma))
     assert sigma < 0.01
 
@@ -138,14 +138,14 @@ def test_hidden_rows_and_noise_are_outliers():
     early = (events.y > 400) & (events.y < 425)
     moved = Events.of(events.t_us - 60 * early, events.x, events.y, events.p)[~hidden]
     noisy = merged(moved, noise_events(2e6, 90_000))
-    assert measured(noisy)[0] == pytest.approx(0.2, abs=0.03)
+    assert measure(noisy)[0] == pytest.approx(0.2, abs=0.03)
 
 
 @pytest.mark.parametrize("events", [Events.empty(), EVENTS[:3], noise_events(1e8, 30_000)])
 def test_nothing_to_see_is_nothing_known(events):
-    assert np.isnan(measured(events)).all()
+    assert np.isnan(measure(events)).all()
     # A small bar has no rows to tell apart.
-    assert np.isnan(measured(EVENTS, 20.0)[0])
+    assert np.isnan(measure(EVENTS, 20.0)[0])
 
 
 def test_packets_are_averaged_and_changes_followed():
@@ -161,7 +161,7 @@ def test_packets_are_averaged_and_changes_followed():
 def test_the_receiver_reads_a_bar_whose_ends_are_a_chip_apart(row_us):
     bar = IdealBar(random_symbols(LINK, 4), cluster_px=26.0, y_px=360.2, shake_px=6)
     events = read_late(ideal_events(LINK, bar, events_per_edge=2), row_us, bar.y_px)
-    frames = frames_of(received(LINK, events)[1])
+    frames = frames_of(receive_cut(LINK, events)[1])
     assert len(frames) >= 30
     number = np.array([f.t_us - bar.start_us for f in frames]) / 100.0
     packet = (number // LINK.packet.packet_chips).astype(int)

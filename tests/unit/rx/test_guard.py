@@ -41,7 +41,7 @@ def link_with(role, compiled):
     return LINK.with_algorithm(role, SimpleNamespace(compile=compiled), id="mine")
 
 
-def received(link):
+def receive_stream(link):
     receiver = Receiver(link)
     receiver.feed(EVENTS)
     receiver.close()
@@ -58,7 +58,7 @@ class Changed:
         return (lambda *given: self._change(found(*given))) if name == self._method else found
 
 
-def changed(role, change):
+def change_algorithm(role, change):
     """The link with an algorithm that gives something else than the built-in one."""
     built_in = LINK.algorithm(role)
 
@@ -89,7 +89,7 @@ def changed(role, change):
 )
 def test_what_fails_in_a_frame_is_named(role, fault, message):
     with pytest.raises(PluginError) as caught:
-        received(changed(role, raises(fault)))
+        receive_stream(change_algorithm(role, raises(fault)))
     assert str(caught.value).startswith(f"{role} algorithm 'mine': {message} (test_guard.py, line ")
     assert str(caught.value).endswith(f"; try: evlcp check {role} mine")
     assert caught.value.__cause__ is fault
@@ -97,7 +97,7 @@ def test_what_fails_in_a_frame_is_named(role, fault, message):
 
 def test_an_interrupt_in_an_algorithm_is_the_user_s():
     with pytest.raises(KeyboardInterrupt):
-        received(changed("ranging", raises(KeyboardInterrupt())))
+        receive_stream(change_algorithm("ranging", raises(KeyboardInterrupt())))
 
 
 @pytest.mark.parametrize("role", ROLES)
@@ -128,14 +128,14 @@ def test_more_locks_than_a_step_has_room_for_are_refused():
     lock = SyncLock(0.0, 100.0, 10.0, 20.0, 1.0)
     gives = SimpleNamespace(init=lambda: None, step=lambda *_: (None, [lock] * 1001))
     with pytest.raises(PluginError, match=r"gave 1001 locks in a step, expected at most 1000"):
-        received(link_with("synchronization", lambda *_: gives))
+        receive_stream(link_with("synchronization", lambda *_: gives))
 
 
 def but(**changes):
     return lambda found: replace(found, **changes)
 
 
-def bent(**changes):
+def curved_range(**changes):
     """What it says of a lean, of three boundaries, is so."""
     return but(curvature=replace(Curvature(*np.ones((3, 3))), **changes))
 
@@ -176,7 +176,11 @@ ODD = [
     ("ranging", but(distance_m=10**5000), "distance_m = a int that cannot be shown"),
     ("ranging", but(sigma_m=-1.0), r"sigma_m = -1\.0, expected a number from 0, or NaN"),
     ("ranging", but(curvature=3), "int, expected Curvature"),
-    ("ranging", bent(phase_bias=np.zeros(2)), r"curvature.phase_bias of shape \(2,\), expected \(3,\)"),
+    (
+        "ranging",
+        curved_range(phase_bias=np.zeros(2)),
+        r"curvature.phase_bias of shape \(2,\), expected \(3,\)",
+    ),
     ("ranging", but(curvature=Curvature(*np.ones((3, 3, 1)))), r"curvature.place of shape \(3, 1\)"),
     ("tracking", lambda found: (found[0] * math.nan, found[1]), r"values \[nan"),
     ("tracking", lambda found: (found[0][:0], found[1]), r"values of shape \(0,\), expected"),
@@ -188,7 +192,7 @@ ODD = [
 def test_what_no_next_stage_can_work_with_is_named(role, change, message):
     named = rf"^{role} algorithm 'mine': gave {message}.*; try: evlcp check"
     with pytest.raises(PluginError, match=named) as caught:
-        received(changed(role, change))
+        receive_stream(change_algorithm(role, change))
     assert len(str(caught.value).splitlines()) == 1
 
 
@@ -201,7 +205,7 @@ def test_what_no_next_stage_can_work_with_is_named(role, change, message):
     ],
 )
 def test_other_types_of_right_values_pass(role, change):
-    received(changed(role, change))
+    receive_stream(change_algorithm(role, change))
 
 
 @pytest.mark.parametrize(
@@ -222,7 +226,7 @@ def test_an_error_correction_that_gives_another_thing_is_named(gives, message):
         (lambda _: None, "TypeError: gave NoneType at compile"),
     ):
         with pytest.raises(PluginError, match=f"^error-correction algorithm 'mine': {expected}"):
-            received(link_with("error-correction", compiled))
+            receive_stream(link_with("error-correction", compiled))
 
 
 def test_hooks_that_exit_end_nothing(demo_raw):

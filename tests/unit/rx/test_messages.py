@@ -296,7 +296,7 @@ def judge_of(*keys, **spec):
     return BeaconJudge(MessageSpec(trusted_keys=keys, **spec), CODER.digest)
 
 
-def judged(now_s=None, *, keys=(), **may):
+def judge_beacon(now_s=None, *, keys=(), **may):
     """What is thought of the operator's beacon, whose key may sign so much."""
     spec = {name: may.pop(name) for name in ("max_age_s", "revoked_keys", "oldest_sequence") if name in may}
     keys = keys or (TrustedKey(operator().public, **may),)
@@ -304,7 +304,7 @@ def judged(now_s=None, *, keys=(), **may):
     return judge_of(*keys, **spec).judge(message, PLACE, signature, now_s)
 
 
-def around(north_m, east_m, radius_m):
+def area_around(north_m, east_m, radius_m):
     """An area about a place beside the beacon's; a metre of the sphere, good to a few parts in a thousand."""
     east_deg = east_m / (111_412 * np.cos(np.radians(35.1)))
     return {
@@ -320,21 +320,21 @@ def around(north_m, east_m, radius_m):
         ({"last_id": 6}, "transmitter 7"),
         ({"first_id": 7, "last_id": 7}, ""),
         ({"first_id": 8, "last_id": 9}, "transmitter 7"),
-        (around(99, 0, 100), ""),
-        (around(101, 0, 100), "this place"),
-        (around(0, 101, 100), "this place"),
+        (area_around(99, 0, 100), ""),
+        (area_around(101, 0, 100), "this place"),
+        (area_around(0, 101, 100), "this place"),
     ],
 )
 def test_a_key_is_for_its_transmitter_ids_and_area(may, why):
     wrong = "forged", f"signed by a key that is not for {why}"
-    assert judged(**may) == (wrong if why else ("verified", ""))
+    assert judge_beacon(**may) == (wrong if why else ("verified", ""))
 
 
 def test_several_entries_of_a_key_are_one_or_the_other():
-    limits = around(-4_000_000, 0, 10.0), {"first_id": 8}, around(0, 0, 10.0)
+    limits = area_around(-4_000_000, 0, 10.0), {"first_id": 8}, area_around(0, 0, 10.0)
     keys = tuple(TrustedKey(operator().public, **may) for may in limits)
-    assert judged(keys=keys[:2]).trust == "forged"
-    assert judged(keys=keys).trust == "verified"
+    assert judge_beacon(keys=keys[:2]).trust == "forged"
+    assert judge_beacon(keys=keys).trust == "verified"
 
 
 DAY, OLD = {"valid_from": "2026-03-01", "valid_to": "2026-03-02"}, {"max_age_s": 100.0}
@@ -358,7 +358,7 @@ DAY, OLD = {"valid_from": "2026-03-01", "valid_to": "2026-03-02"}, {"max_age_s":
     ],
 )
 def test_a_key_is_valid_from_and_to_and_a_beacon_as_old_as_the_receiver_asks_for(may, later_s, why):
-    found = judged(None if later_s is None else SIGNED_S + later_s, **may)
+    found = judge_beacon(None if later_s is None else SIGNED_S + later_s, **may)
     assert found.trust == ("unverified" if why else "verified")
     assert found.why.endswith(why)
     assert found.why.startswith("signed 2026-03-01 12:00:00 UTC" if why else "")
@@ -366,7 +366,7 @@ def test_a_key_is_valid_from_and_to_and_a_beacon_as_old_as_the_receiver_asks_for
 
 def test_a_revoked_key_signs_nothing():
     revoked = "forged", "signed by a key that is revoked"
-    assert judged(revoked_keys=(operator().public,)) == revoked
+    assert judge_beacon(revoked_keys=(operator().public,)) == revoked
     # Revoked only, and trusted never.
     message, signature = operator().beacon(SIGNED_S)
     judge = judge_of(revoked_keys=(operator().public,))
@@ -402,7 +402,7 @@ def test_an_unsigned_beacon_that_contradicts_a_verified_one_is_forged(change, tr
 
 def test_an_old_beacon_is_replayed():
     reason = f"replayed: sequence {SIGNED_S} is older than messages.oldest_sequence {SIGNED_S + 1}"
-    assert judged(oldest_sequence=SIGNED_S + 1) == ("forged", reason)
+    assert judge_beacon(oldest_sequence=SIGNED_S + 1) == ("forged", reason)
     judge = judge_of(*operator().trusted)
 
     def shown(sequence, place, transmitter_id=7):

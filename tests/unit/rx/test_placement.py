@@ -23,7 +23,7 @@ def map_of(selected):
     return PresenceMap(shown, 2, selected, shown.repeat(2, 1).repeat(2, 2))
 
 
-def drawn(centres_m, *instances, size=SIZE, half_px=2.0, conj=False):
+def draw_cells(centres_m, *instances, size=SIZE, half_px=2.0, conj=False):
     """Cells of 2 px whose middle lies in a cluster of an instance (scale, shift)."""
     width, height = size
     y, x = np.mgrid[: height // 2, : width // 2] * 2 + 0.5
@@ -38,7 +38,7 @@ def drawn(centres_m, *instances, size=SIZE, half_px=2.0, conj=False):
     return map_of(selected)
 
 
-def cluttered(presence, rng, share):
+def add_clutter(presence, rng, share):
     """A share of all cells shows clusters at random."""
     selected = presence.selected
     hit = rng.random(selected.shape[1:]) < share
@@ -46,7 +46,7 @@ def cluttered(presence, rng, share):
     return map_of(np.where(hit, which, selected))
 
 
-def covered(presence, clusters):
+def cover_clusters(presence, clusters):
     return map_of(presence.selected & ~np.isin(np.arange(len(presence.selected)), clusters)[:, None, None])
 
 
@@ -54,7 +54,7 @@ def covered(presence, clusters):
 @given(st.floats(40, 200), st.floats(-math.pi, math.pi), st.floats(0, 2), st.floats(0, 2))
 def test_a_bar_at_any_size_and_turn(px_per_m, turn, right, down):
     scale, shift = px_per_m * np.exp(1j * turn), complex(112 + right, 112 + down)
-    (found,) = placements(drawn(CENTRES, (scale, shift), size=(224, 224)), LINE)
+    (found,) = placements(draw_cells(CENTRES, (scale, shift), size=(224, 224)), LINE)
     # A cell is two pixels wide.
     assert np.abs(found.places(LINE) - scale * LINE.at_m - shift).max() < 1.5
     assert found.seen.all()
@@ -66,7 +66,7 @@ def test_clutter_and_a_cover(seed):
     rng = np.random.default_rng(seed)
     hidden = sorted(rng.choice(16, 8, replace=False).tolist())
     scale, shift = 150 * np.exp(0.02j), 24.3 + 110.2j
-    presence = cluttered(covered(drawn(CENTRES, (scale, shift)), hidden), rng, 0.05)
+    presence = add_clutter(cover_clusters(draw_cells(CENTRES, (scale, shift)), hidden), rng, 0.05)
     found = placements(presence, LINE)[0]
     # The centre is the layout's, not that of the part that is seen.
     assert abs(found.shift - shift) < 1.5
@@ -76,7 +76,7 @@ def test_clutter_and_a_cover(seed):
 
 def test_a_reflection_beside_stays_out_of_the_footprints():
     bar, image = (100 + 0j, 12.0 + 60j), (100 + 0j, 34.0 + 60j)
-    presence = drawn(CENTRES, bar, image, size=(48, 120))
+    presence = draw_cells(CENTRES, bar, image, size=(48, 120))
     found = placements(presence, LINE)
     assert len(found) == 2
     assert sorted(round(f.shift.real) for f in found) == [12, 34]
@@ -104,20 +104,20 @@ def test_bayes_cell_by_cell(seed):
 
 
 def test_few_clusters_are_enough_where_the_scale_is_known():
-    whole = drawn(CENTRES, (150, 24 + 110j))
+    whole = draw_cells(CENTRES, (150, 24 + 110j))
     (before,) = placements(whole, LINE)
     for hidden in (range(11), range(5, 16), [k for k in range(16) if k not in (2, 6, 7, 8, 13)]):
-        (found,) = placements(covered(whole, hidden), LINE, before)
+        (found,) = placements(cover_clusters(whole, hidden), LINE, before)
         assert abs(found.shift - (24 + 110j)) < 2
         assert found.seen.sum() == 5
     # Three could be there by chance.
-    assert not placements(covered(whole, range(13)), LINE, before)
+    assert not placements(cover_clusters(whole, range(13)), LINE, before)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_clusters_out_of_their_order_are_no_bar(seed):
-    presence = drawn(CENTRES[np.random.default_rng(seed).permutation(16)], (150, 24 + 110j))
-    (before,) = placements(drawn(CENTRES, (150, 24 + 110j)), LINE)
+    presence = draw_cells(CENTRES[np.random.default_rng(seed).permutation(16)], (150, 24 + 110j))
+    (before,) = placements(draw_cells(CENTRES, (150, 24 + 110j)), LINE)
     assert placements(presence, LINE) == placements(presence, LINE, before) == []
 
 
@@ -126,7 +126,7 @@ def test_a_panel_and_its_mirror_image(conj):
     centres = PANEL.cluster_centres_m()
     layout = layout_of(centres)
     scale, shift = 300 * np.exp(0.1j), 64.2 + 63.7j
-    (found,) = placements(drawn(centres, (scale, shift), size=(128, 128), conj=conj), layout)
+    (found,) = placements(draw_cells(centres, (scale, shift), size=(128, 128), conj=conj), layout)
     assert found.mirrored == conj
     assert abs(found.shift - shift) < 1
     assert np.abs(found.scale - scale) < 6
@@ -142,13 +142,13 @@ def test_one_column_of_two_is_not_taken_for_the_other_in_a_mirror(column):
     for _ in range(24):
         scale = 120 * np.exp(0.01j * rng.normal())
         shift = complex(24, 60) + complex(*rng.uniform(-1, 1, 2)) - scale * (2 * column - 1)
-        shown = drawn(centres, (scale, shift), size=(48, 120))
-        found += placements(covered(shown, np.arange(8) + 8 - 8 * column), layout_of(centres))[:1]
+        shown = draw_cells(centres, (scale, shift), size=(48, 120))
+        found += placements(cover_clusters(shown, np.arange(8) + 8 - 8 * column), layout_of(centres))[:1]
     assert [one.mirrored for one in found] == [False] * 24
 
 
 def test_one_cluster_is_where_its_cells_are():
-    layout, presence = layout_of(np.zeros((1, 2))), drawn(np.zeros((1, 2)), size=(40, 40))
+    layout, presence = layout_of(np.zeros((1, 2))), draw_cells(np.zeros((1, 2)), size=(40, 40))
     presence.selected[0, 3:5, 7:9] = True
     (found,) = placements(presence, layout)
     assert found.shift == 15.5 + 7.5j
@@ -156,4 +156,4 @@ def test_one_cluster_is_where_its_cells_are():
 
 
 def test_nothing_seen_is_nowhere():
-    assert placements(drawn(CENTRES), LINE) == []
+    assert placements(draw_cells(CENTRES), LINE) == []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
-from rx_streams import LINK, frames_of, received
+from rx_streams import LINK, frames_of, receive_cut
 
 from evlcp_sdk.files import find_shipped_file
 from evlcp_sdk.io import read_events
@@ -23,7 +23,7 @@ FINE = 8
 """Parts that a pixel's side is cut into to draw with."""
 
 
-def drawn(layout, turn, shift, half_m, size):
+def draw_clusters(layout, turn, shift, half_m, size):
     """Clusters as boxes of `half_m`, each pixel with its share of each: an ideal image."""
     width, height = size
     y, x = (np.mgrid[: height * FINE, : width * FINE] + 0.5) / FINE - 0.5
@@ -55,7 +55,7 @@ def truth_of(turn, shift, layout):
 @given(st.floats(75, 220), st.floats(-0.15, 0.15), st.integers(0, FINE), st.integers(0, FINE))
 def test_points_of_an_ideal_bar(px_per_m, roll, right, down):
     turn, shift = px_per_m * np.exp(1j * roll), 24 + 112j + complex(right, down) / FINE
-    presence = drawn(CENTRES, turn, shift, (1.2 / px_per_m, 0.03), (48, 224))
+    presence = draw_clusters(CENTRES, turn, shift, (1.2 / px_per_m, 0.03), (48, 224))
     points, sigma, *_ = points_of(presence)
     off = points - truth_of(turn, shift, CENTRES)
     assert np.abs(off).max() < 0.2
@@ -70,12 +70,12 @@ def test_points_of_an_ideal_bar(px_per_m, roll, right, down):
 def test_a_lying_bar_and_one_upside_down(turn):
     size = (200, 48) if turn.imag else (48, 200)
     shift = complex(size[0] / 2 + 0.3, size[1] / 2 - 0.2)
-    points, *_ = points_of(drawn(CENTRES, turn, shift, (0.008, 0.03), size))
+    points, *_ = points_of(draw_clusters(CENTRES, turn, shift, (0.008, 0.03), size))
     assert np.abs(points - truth_of(turn, shift, CENTRES)).max() < 0.2
 
 
 def test_dark_clusters_are_unseen_and_cells_out_of_place_are_left_out():
-    presence = drawn(CENTRES, 150, 24.3 + 100.4j, (0.008, 0.03), (48, 200))
+    presence = draw_clusters(CENTRES, 150, 24.3 + 100.4j, (0.008, 0.03), (48, 200))
     selected, pixels = presence.selected, presence.pixels
     selected[4], pixels[4] = False, 0
     selected[9, 5:8, 2], pixels[9, 10:16, 4:6] = True, 0.9
@@ -92,13 +92,13 @@ def test_a_panel_has_neighbours_on_both_axes(down):
     layout = panel.cluster_centres_m()
     turn, shift = 700 * np.exp(0.05j), 64.2 + 63.7j
     shown = layout * [1, down]
-    presence = drawn(shown, turn, shift, (0.02, 0.02), (128, 128))
+    presence = draw_clusters(shown, turn, shift, (0.02, 0.02), (128, 128))
     points, *_ = points_of(presence, layout)
     assert np.abs(points - truth_of(turn, shift, shown)).max() < 0.25
 
 
 def test_two_clusters_give_no_points():
-    presence = drawn(CENTRES, 150, 24 + 100j, (0.008, 0.03), (48, 200))
+    presence = draw_clusters(CENTRES, 150, 24 + 100j, (0.008, 0.03), (48, 200))
     points, sigma, _, centre_px = points_of(presence, at_px=(3.0, 5.0), seen=np.arange(16) < 2)
     assert points.shape == (16, 2)
     assert np.isnan([*points.T, sigma]).all()
@@ -108,7 +108,7 @@ def test_two_clusters_give_no_points():
 @settings(max_examples=25)
 @given(st.floats(0, 2))
 def test_cells_that_hold_more_of_one_side_do_not_shift_a_bar(dx):
-    whole = drawn(CENTRES, 150.0, complex(24 + dx, 100), (2.6 / 150, 0.03), (48, 200))
+    whole = draw_clusters(CENTRES, 150.0, complex(24 + dx, 100), (2.6 / 150, 0.03), (48, 200))
     first, want = 2 * int((24 + dx - 2) / 2), (24 + dx + 8, 100 + 2)
     pixels = whole.pixels.copy()
     pixels[:, :, :first] = pixels[:, :, first + 4 :] = 0
@@ -123,10 +123,10 @@ def lies(points):
     return np.ptp(points[:, 0]) > np.ptp(points[:, 1])
 
 
-def simulated(scene, sets, seed=None, lying=False):
+def simulated_errors(scene, sets, seed=None, lying=False):
     """By how much points of a scene's upright or lying bar are off its truth, px, (frames, K, 2)."""
     simulation = Simulation(load_scene(scene, sets), seed)
-    frames = frames_of(received(LINK, Events.concat(list(simulation.stream())))[1])
+    frames = frames_of(receive_cut(LINK, Events.concat(list(simulation.stream())))[1])
     mine = [f for f in frames if np.isfinite(f.points_px).all() and lies(f.points_px) == lying]
     bars = [bar.strips[0].strip.cuts_m() for bar in simulation.bars]
     cuts = next(cuts for cuts in bars if lies(cuts) == lying)
@@ -138,7 +138,7 @@ def simulated(scene, sets, seed=None, lying=False):
 def test_points_of_a_turning_camera_lie_where_they_are():
     """At 45 degrees a second the image moves by half a pixel in a chip."""
     sets = ["duration_s=0.1", 'motion.path_file="turning.csv"', "motion.vib_rate_rad_s=0.02"]
-    off = simulated("examples/scenes/one-bar.toml", sets, 5)
+    off = simulated_errors("examples/scenes/one-bar.toml", sets, 5)
     assert len(off) > 12
     # All are early alike, by a share of a chip.
     assert np.abs(off.mean((0, 1))).max() < 0.3
@@ -150,7 +150,7 @@ def test_points_of_a_turning_camera_lie_where_they_are():
 def test_sigma_is_the_scatter_about_the_similarity():
     squares, freedom = 0.0, 0
     for frame in frames_of(
-        received(LINK, read_events(find_shipped_file("recordings", "night-50m-30kmh-cut.raw")))[1]
+        receive_cut(LINK, read_events(find_shipped_file("recordings", "night-50m-30kmh-cut.raw")))[1]
     ):
         seen = np.isfinite(frame.points_px[:, 0])
         z, c = (one[seen] @ [1, 1j] for one in (frame.points_px, CENTRES))

@@ -40,12 +40,12 @@ def drive(frames, sigma_m, bend_px, seed, *, said_m=None, start_m=50.0, speed_m_
     bends = [bend_of(lean_deg, m, bend_px, rng) for m in true_m.tolist()]
     given = zip(seen_m.tolist(), bends, strict=True)
     measured = (Range(m, said_m or sigma_m, 15, late_chips, bend) for m, bend in given)
-    _, found = kept(measured, how.get("sight", AHEAD))
+    _, found = remembered_lengths(measured, how.get("sight", AHEAD))
     assert {one.pairs for one in found} == {15}
     return np.stack([[one.distance_m for one in found] - true_m, [one.sigma_m for one in found]], axis=1)
 
 
-def kept(measured, sight=AHEAD):
+def remembered_lengths(measured, sight=AHEAD):
     """What is remembered after frames with these distances, and the distances as they should be."""
     keeper, state, out = RangeKeeper(), Ranges(), []
     for i, one in enumerate(measured):
@@ -64,7 +64,7 @@ def test_without_a_distance_nothing_changes():
         assert keeper.step(state, 0.0, CHIP_US, measured, AHEAD) == (state, measured)
 
 
-def foreshortened(along=0.0, about_deg=0.0, sigma_deg=0.7, share=0.1):
+def foreshortening(along=0.0, about_deg=0.0, sigma_deg=0.7, share=0.1):
     """Mean and standard deviation of the foreshortening over what is likely of a lean, by quadrature."""
     sigma, most, about = math.radians(sigma_deg), math.radians(5), math.radians(about_deg)
 
@@ -87,8 +87,8 @@ def test_a_first_distance_stays_but_for_the_tilt_that_is_known_or_likely(along, 
     if lean_deg is not None:
         sight = LineOfSight(along, tilt_sine=math.sin(math.radians(lean_deg)), tilt_sigma=math.radians(0.3))
         likely = lean_deg, 0.3, 6e-5
-    _, (found,) = kept([Range(50.0, 0.02, 15)], sight)
-    mean, spread = foreshortened(along, *likely)
+    _, (found,) = remembered_lengths([Range(50.0, 0.02, 15)], sight)
+    mean, spread = foreshortening(along, *likely)
     assert found.distance_m == pytest.approx(50 * mean, abs=1e-3 if likely else 2e-4)
     assert found.sigma_m == pytest.approx(math.hypot(0.02 * mean, 50 * spread), rel=0.03 if likely else 0.02)
 
@@ -129,7 +129,7 @@ def test_a_tilt_is_found_in_the_curvature(lean_deg, told_deg):
 def test_a_distance_keeps_nothing_of_old_curvatures_and_distances():
     rng = np.random.default_rng(5)
     measured = [Range(45.1, 0.01, 15, 8.0, bend_of(4.0, 45.0, 0.04, rng)) for _ in range(400)]
-    state, _ = kept(measured)
+    state, _ = remembered_lengths(measured)
     weight = measured[-1].curvature.weight
     assert len(state.past) <= 0.3 / (FRAME_US * 1e-6) + 1
     assert state.bend[0].max() < 1.01 * weight.max() / (1 - math.exp(-FRAME_US * 1e-6))
@@ -161,7 +161,7 @@ def waves(spacings_px, height_px, rng):
         frames.append(
             frame_of(seem_px, true_m, 0.02 / 16.7 / spacing_px * true_m, phase_bias=wave, phase_bias_m=wave_m)
         )
-    found = kept(frames)[1][-1]
+    found = remembered_lengths(frames)[1][-1]
     return found.distance_m - true_m, found.sigma_m, frames[-1].distance_m - true_m, frames[-1].sigma_m
 
 
@@ -186,7 +186,7 @@ def test_what_is_not_known_of_the_pixel_phase_bias_is_in_the_sigma():
     assert np.mean((raw / raw_sigma) ** 2) > 10
 
 
-def bent(frames, off_px, rng):
+def curved_frames(frames, off_px, rng):
     """Frames of a bar 45 m away whose boundaries seem to lie off by so much, (15,): a scale through all."""
     spacing_px = FOCAL_PX * SPACING_M / 45
     seem_px = spacing_px * PLACES + off_px + 0.04 * rng.standard_normal((frames, 15))
@@ -199,9 +199,9 @@ def test_what_bends_an_image_does_not_average_away(height_px):
     """A drop over the bar's lower half: all frames err alike, and each shows it, or some together."""
     rng, at = np.random.default_rng(12), PLACES / 4 - 1
     off_px = height_px * at * np.exp((1 - at**2) / 2)
-    measured = bent(60, off_px, rng)
+    measured = curved_frames(60, off_px, rng)
     raw = np.array([one.distance_m - 45 for one in measured])
-    _, found = kept(measured)
+    _, found = remembered_lengths(measured)
     error = np.array([one.distance_m - 45 for one in found])
     # No lean is seen in it, and the bend is not taken for more than it is.
     assert np.abs(error)[-20:].max() < np.abs(raw)[-20:].max() + 0.02
@@ -209,18 +209,18 @@ def test_what_bends_an_image_does_not_average_away(height_px):
         assert one.standing_m > 0.4 * abs(raw.mean())
         assert one.sigma_m > one.standing_m
         assert one.distortion_px is not None
-    straight = kept(bent(60, 0 * PLACES, rng))[1]
+    straight = remembered_lengths(curved_frames(60, 0 * PLACES, rng))[1]
     assert all(one.standing_m == 0 and one.distortion_px is None for one in straight)
     # Some time after it is gone, nothing is left of it.
-    _, again = kept(measured + bent(1500, 0 * PLACES, rng))
+    _, again = remembered_lengths(measured + curved_frames(1500, 0 * PLACES, rng))
     assert again[-1].sigma_m == pytest.approx(straight[-1].sigma_m, rel=0.3)
 
 
 def test_clusters_with_dark_leds_are_taken_out_and_shown():
     off_px = np.zeros(15)
     off_px[[1, 2, 8, 13]] = -0.7, -1.4, 0.7, 0.7
-    measured = bent(20, off_px, np.random.default_rng(13))
-    _, found = kept(measured)
+    measured = curved_frames(20, off_px, np.random.default_rng(13))
+    _, found = remembered_lengths(measured)
     assert min(abs(one.distance_m - 45) for one in measured) > 0.2
     error = np.array([(one.distance_m - 45, one.sigma_m) for one in found])
     assert np.abs(error[:, 0]).max() < 0.1
@@ -232,7 +232,7 @@ def test_clusters_with_dark_leds_are_taken_out_and_shown():
     alone = Curvature(
         PLACES, np.eye(15)[3], np.where(PLACES[3] == PLACES, 0, bend.weight), None, 0.0, 9.6, 0.5
     )
-    _, (one,) = kept([Range(45.0, 0.01, 14, 8.0, alone)])
+    _, (one,) = remembered_lengths([Range(45.0, 0.01, 14, 8.0, alone)])
     assert one.distortion_px == pytest.approx(0.5 * np.eye(15)[3])
     assert one.standing_m == 0
 
@@ -257,7 +257,7 @@ def dark(rng):
     return (rng.random(15) < 0.25) * rng.choice([-1, 1], 15) * rng.uniform(0.3, 1.5, 15)
 
 
-def seen(error_px, rng):
+def scale_errors(error_px, rng):
     """What a scale through boundaries with such errors is too short by, px, and what they say of it."""
     off = error_px + NOISE_PX * rng.standard_normal(15)
     slope, mean = np.polyfit(PLACES, off, 1)
@@ -265,16 +265,18 @@ def seen(error_px, rng):
     return -slope, straighten(PLACES, off - slope * PLACES - mean + 0.01 * (PLACES**2 - 56 / 3), 0.1, 0.01)
 
 
-def judged(errors_of, rng):
+def error_statistics(errors_of, rng):
     """Errors of scales, those of the straight bars' spacing, px, and squares of those by their variance."""
-    found = [(px, one) for px, one in (seen(errors_of(rng), rng) for _ in range(400)) if one is not None]
+    found = [
+        (px, one) for px, one in (scale_errors(errors_of(rng), rng) for _ in range(400)) if one is not None
+    ]
     return np.array([(px, px - one.slope, (px - one.slope) ** 2 / one.variance) for px, one in found]).T
 
 
 def test_dark_leds_are_distinguished_from_a_straight_bar():
     """Most boundaries agree: the error is a third of that of a scale through all, and its sigma is true."""
     rng = np.random.default_rng(2)
-    before, after, squares = judged(dark, rng)
+    before, after, squares = error_statistics(dark, rng)
     assert len(before) > 300
     assert np.median(np.abs(after)) < 0.35 * np.median(np.abs(before))
     assert np.sqrt(np.mean(after**2)) < 0.65 * np.sqrt(np.mean(before**2))
@@ -284,7 +286,7 @@ def test_dark_leds_are_distinguished_from_a_straight_bar():
 def test_what_drops_add_to_a_scale_is_in_the_sigma():
     """Most of it is seen by how neighbours err, but a drop over half of a bar hardly bends it."""
     rng = np.random.default_rng(3)
-    before, after, squares = np.abs(judged(drops, rng))
+    before, after, squares = np.abs(error_statistics(drops, rng))
     assert len(before) > 350
     assert np.sqrt(np.mean(after**2)) < 0.8 * np.sqrt(np.mean(before**2))
     assert np.median(after) < 0.7 * np.median(before)

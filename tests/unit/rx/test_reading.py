@@ -14,7 +14,7 @@ WORDS = np.concatenate([ROWS, -ROWS])
 BITS = np.arange(16)[:, None] >> np.arange(3, -1, -1) & 1
 
 
-def sent_and_read(rng, noise, scale):
+def send_and_read(rng, noise, scale):
     """A frame over a Gaussian channel, by max-log, its LLRs off by a factor."""
     sent = rng.integers(0, 16, 16)
     gain = rng.uniform(0.8, 1.2, 16)
@@ -33,7 +33,7 @@ def test_of_frames_with_quality_q_one_less_q_are_wrong(noise, least, scale):
     rng = np.random.default_rng(7)
     wrong, doubt = [], []
     for _ in range(400):
-        sent, read = sent_and_read(rng, noise, scale)
+        sent, read = send_and_read(rng, noise, scale)
         soft = calibrate_llr(read, ALL)
         given = soft.symbols >= 0
         wrong.append((soft.symbols != sent)[given].any())
@@ -46,7 +46,7 @@ def test_what_is_rather_wrong_is_not_given():
     rng = np.random.default_rng(3)
     hidden = right = 0
     for _ in range(300):
-        sent, read = sent_and_read(rng, 1.6, 1.0)
+        sent, read = send_and_read(rng, 1.6, 1.0)
         soft = calibrate_llr(read, ALL)
         hidden += int((soft.symbols < 0).sum())
         right += int((read.symbols == sent)[soft.symbols < 0].sum())
@@ -58,7 +58,7 @@ def test_what_is_rather_wrong_is_not_given():
 
 
 def test_of_what_is_not_seen_nothing_is_given():
-    _, read = sent_and_read(np.random.default_rng(0), 0.1, 1.0)
+    _, read = send_and_read(np.random.default_rng(0), 0.1, 1.0)
     seen = np.arange(16) != 5
     soft = calibrate_llr(read, seen)
     assert soft.symbols[5] == -1

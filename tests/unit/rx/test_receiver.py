@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rx_streams import LINK, frames_of, lit, noise_events, received, right_frames, said
+from rx_streams import LINK, frame_content, frames_of, lit, noise_events, receive_cut, right_frames
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import load_link
@@ -38,7 +38,7 @@ def test_every_link_is_read_to_the_last_frame(sets, ppm):
     every = link.packet.pilot_every
     # Where pilots are few it moves by a spacing while one of eight frames holds.
     bar, events = lit(5, link=link, ppm=ppm, shake_px=16 if every > 1 else 0)
-    _, packets = received(link, events)
+    _, packets = receive_cut(link, events)
     assert right_frames(packets, bar, link) == 5 * link.packet.frames
     assert [p.packet for p in packets] == [0, 1, 2, 3, 4]
     # Two packets of 2 us jitter tell the rate to 40 ppm, five to 20.
@@ -52,7 +52,7 @@ def test_frames_before_the_first_preamble_are_decoded(every, start_us, first):
     """Those that began in the recording, and of few pilots those whose pilot did."""
     link = load_link(overrides=[f"air.pilot_every={every}"])
     bar, events = lit(3, link=link, start_us=start_us)
-    _, packets = received(link, events)
+    _, packets = receive_cut(link, events)
     assert [f.frame for f in packets[0].frames] == list(range(first, 10))
     assert right_frames(packets, bar, link) == 30 - first
 
@@ -82,7 +82,7 @@ def test_a_bar_in_the_dark(every, first, end, given_, count):
     chips = [frame_chip(link, 1, frame) + more for frame, more in (first, end)]
     probe = Probe(list)
     seen = events[~between(events, bar, *chips)]
-    receiver, packets = received(link, seen, hook=Registry.load(probe).hook)
+    receiver, packets = receive_cut(link, seen, hook=Registry.load(probe).hook)
     assert [f.frame for f in packets[1].frames] == given_
     why = next(name for name, many in count.items() if many)
     missing = [n for n in range(10) if n not in given_]
@@ -113,7 +113,7 @@ def test_a_step_of_light_costs_the_frame_that_it_drowns(drowned, start_us, which
     bar, events = lit(4, shake_px=16, start_us=start_us)
     first_us = int(bar.start_us) + 100 * (frame_chip(LINK, *which) + LINK.packet.pilot_chips)
     lost = drowned & (events.t_us > first_us + 200) & (events.t_us < first_us + 1400)
-    receiver, packets = received(LINK, merged(events[~lost], flashes(first_us)))
+    receiver, packets = receive_cut(LINK, merged(events[~lost], flashes(first_us)))
     frames = frames_of(packets)
     assert len(frames) == sum(start_us + 100 * frame_chip(LINK, *divmod(n, 10)) >= 0 for n in range(40))
     for f in frames:
@@ -131,7 +131,7 @@ def test_events_that_come_sooner_in_brighter_light(sooner_us):
     e = ideal_events(LINK, bar, delay_on_us=70.0, delay_off_us=70.0)
     bright = e.t_us >= bar.start_us + 100 * frame_chip(LINK, 1, 3) + 60
     moved = merged(Events.of(e.t_us - sooner_us * bright, e.x, e.y, e.p)[~bright | (e.x % 2 == 0)])
-    assert right_frames(received(LINK, moved)[1], bar, late_us=(0, 90)) == 30
+    assert right_frames(receive_cut(LINK, moved)[1], bar, late_us=(0, 90)) == 30
 
 
 def test_a_bar_that_says_nothing_is_no_transmitter():
@@ -142,7 +142,7 @@ def test_a_bar_that_says_nothing_is_no_transmitter():
         # The last edge of the pilot belongs to it.
         chip = frame_chip(LINK, *divmod(number, 10)) + packet.pilot_chips
         dark |= between(events, bar, chip + 1, chip + packet.info_chips)
-    receiver, packets = received(LINK, events[~dark])
+    receiver, packets = receive_cut(LINK, events[~dark])
     assert packets == []
     assert (receiver.counts["frames_unread"], receiver.counts["frames"]) == (20, 0)
 
@@ -155,7 +155,7 @@ def test_a_frame_that_the_end_cuts_is_not_given():
     bar, events = lit(2)
     end_us = bar.start_us + 100 * frame_chip(LINK, 1, 5)
     for after_us, found, cut in ((-50, 4, 0), (60, 4, 0), (220, 4, 1), (290, 5, 0), (1000, 5, 0)):
-        receiver, packets = received(LINK, events[events.t_us < end_us + after_us])
+        receiver, packets = receive_cut(LINK, events[events.t_us < end_us + after_us])
         assert [f.frame for f in packets[1].frames] == list(range(found)), after_us
         assert right_frames(packets, bar) == receiver.counts["frames"] == 10 + found
         assert receiver.counts["frames_at_end"] == cut, after_us
@@ -165,7 +165,7 @@ def test_a_frame_that_the_end_cuts_is_not_given():
 def test_a_bar_that_sweeps_from_the_first_frame_on(shake_px, shake_hz):
     """Round in a circle at 1.5, 5.7 and 7.9 px/ms: in any direction, along the bar and across it."""
     bar, events = lit(4, shake_px=shake_px, shake_hz=shake_hz)
-    receiver, packets = received(LINK, events)
+    receiver, packets = receive_cut(LINK, events)
     assert right_frames(packets, bar) == 40
     assert receiver.counts["regions_opened"] == 1
     for f in frames_of(packets):
@@ -179,7 +179,7 @@ def test_two_bars_a_few_pixels_apart_are_two(apart_px):
     bars, events = zip(
         lit(3, 1, start_us=0), lit(3, 2, start_us=12_345, x_px=400.3 + apart_px, ppm=40), strict=True
     )
-    _, packets = received(LINK, merged(*events))
+    _, packets = receive_cut(LINK, merged(*events))
     for bar in bars:
         mine = [p for p in packets if abs(p.frames[0].x_px - bar.x_px + 0.5) < 1]
         assert len({p.transmitter for p in mine}) == 1
@@ -192,7 +192,7 @@ def test_a_dark_cluster_costs_only_itself():
     top = 350.7 - 72 + 5 * 9
     shown = (events.y < np.floor(top)) | (events.y > np.ceil(top + 9))
     for kept, px, rel in ((shown, 5, 5e-3), (shown | True, [], 2e-3)):
-        frames = frames_of(received(LINK, events[kept])[1])
+        frames = frames_of(receive_cut(LINK, events[kept])[1])
         assert len(frames) == 20
         for f, want in zip(frames, bar.symbols.reshape(-1, 16), strict=True):
             assert np.delete(f.soft.symbols, px).tolist() == np.delete(want, px).tolist()
@@ -206,7 +206,7 @@ def test_a_bar_in_pieces_too_small_to_place_is_put_together():
     hidden = [4, 5, 10, 11]
     bar, events = lit(2, 3, start_us=0, cluster_px=12)
     cluster = (events.y - (bar.y_px - 8 * 12)) // 12
-    frames = frames_of(received(LINK, events[~np.isin(cluster, hidden)])[1])
+    frames = frames_of(receive_cut(LINK, events[~np.isin(cluster, hidden)])[1])
     sent = bar.symbols.reshape(-1, 16).copy()
     sent[:, hidden] = -1
     assert {frame.transmitter for frame in frames} == {0}
@@ -218,7 +218,7 @@ def test_a_bar_lost_from_sight_goes_on_as_the_same():
     bar, events = lit(6, ppm=30)
     hidden = (events.t_us >= 80_000) & (events.t_us < 150_000)
     moved = Events.of(events.t_us, events.x + np.where(events.t_us < 150_000, 0, 70), events.y, events.p)
-    _, packets = received(LINK, moved[~hidden])
+    _, packets = receive_cut(LINK, moved[~hidden])
     assert {p.transmitter for p in packets} == {0}
     # Packets 0 and 1, one frame of 2 that ends as the bar vanishes, 8 of packet 4, and packet 5.
     assert [(p.packet, len(p.frames)) for p in packets] == [(0, 10), (1, 10), (2, 1), (4, 8), (5, 10)]
@@ -237,7 +237,7 @@ def test_a_transmitter_that_starts_anew_is_another(at_us):
     begins = 0, at_us, at_us + 100_000, 300_000
     events = merged(*(e[slice(*e.t_us.searchsorted(begins[k : k + 2]))] for k, e in enumerate(sent)))
     # The camera is said to lean, which every frame that is read contradicts.
-    receiver, packets = received(LINK, events, attitude=Attitude(6.0, 5.0))
+    receiver, packets = receive_cut(LINK, events, attitude=Attitude(6.0, 5.0))
     assert receiver.counts["restarts"] == 2
     assert receiver.counts["frames_rejected"] == 0
     assert receiver.counts["frames_askew"] == receiver.counts["frames"] + receiver.counts["frames_unread"]
@@ -261,13 +261,15 @@ STREAM = merged(
 
 @pytest.mark.parametrize("t0_us", [-123_457, 16_777_001, 1_700_000_000_123_457])
 def test_a_frame_says_the_same_at_any_time_of_the_clock(t0_us):
-    _, later = received(LINK, Events(STREAM.t_us + t0_us, STREAM.x, STREAM.y, STREAM.p))
-    for one, other in zip(received(LINK, STREAM)[1], later, strict=True):
+    _, later = receive_cut(LINK, Events(STREAM.t_us + t0_us, STREAM.x, STREAM.y, STREAM.p))
+    for one, other in zip(receive_cut(LINK, STREAM)[1], later, strict=True):
         assert abs(other.t_us - t0_us - one.t_us) <= 0.25
         for a, b in zip(one.frames, other.frames, strict=True):
             times = {name: getattr(b, name) - t0_us for name in ("t_us", "points_t_us")}
             assert times == pytest.approx({name: getattr(a, name) for name in times}, abs=0.25, rel=0)
-            assert said(replace_fields(b, **{name: getattr(a, name) for name in times})) == said(a)
+            assert frame_content(
+                replace_fields(b, **{name: getattr(a, name) for name in times})
+            ) == frame_content(a)
 
 
 def test_what_is_dropped_is_counted():
@@ -289,7 +291,7 @@ def test_what_is_dropped_is_counted():
 def test_a_camera_that_restarts_its_clock_is_received_again(back_us):
     bar, late_us = IdealBar(random_symbols(LINK, 2)), 10**12
     parts = [ideal_events(LINK, bar, t0_us=t0_us) for t0_us in (late_us, late_us - back_us)]
-    receiver, packets = received(LINK, Events.concat(parts), [len(parts[0])])
+    receiver, packets = receive_cut(LINK, Events.concat(parts), [len(parts[0])])
     assert receiver.counts["clock_restarts"] == 1
     assert receiver.counts["dropped_time_backward"] == receiver.counts["dropped_time_doubtful"] == 0
     assert [f.transmitter for f in frames_of(packets)] == [0] * 20 + [1] * 20
@@ -310,7 +312,7 @@ class Probe(defaultdict):
 def test_probes_see_every_stage(width_px):
     """A thin bar stands in the middle of a cell."""
     probe = Probe(list)
-    received(LINK, lit(2, width_px=width_px, x_px=400.0)[1], hook=Registry.load(probe).hook)
+    receive_cut(LINK, lit(2, width_px=width_px, x_px=400.0)[1], hook=Registry.load(probe).hook)
     assert {len(probe[stage]) for stage in ("frame", "ranging", "decoding", "view")} == {20}
     assert len(probe["synchronization"]) == 2
     assert len(probe["regions"]) >= 40

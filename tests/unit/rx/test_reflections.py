@@ -19,7 +19,7 @@ CODEWORDS = 64
 
 def frame(transmitter, number, symbols=None, *, late_us=0.0, x_px=None, light=100.0, **more):
     """The frame of a number since the start."""
-    symbols = said(number) if symbols is None else symbols
+    symbols = frame_content(number) if symbols is None else symbols
     packet, index = divmod(number, FORMAT.frames)
     t_us = packet * PERIOD_US + FORMAT.frame_start_chip(index) * FORMAT.chip_us + late_us
     soft = SoftSymbols(symbols, np.zeros((len(symbols), 6), np.float32), 1.0)
@@ -29,7 +29,7 @@ def frame(transmitter, number, symbols=None, *, late_us=0.0, x_px=None, light=10
     return FrameDetection(frame, *times, light, int((symbols >= 0).sum()), more.get("mirrored", False))
 
 
-def said(number, seed=0):
+def frame_content(number, seed=0):
     """What a frame says."""
     return np.random.default_rng((seed, number)).integers(0, CODEWORDS, 16)
 
@@ -74,20 +74,20 @@ def test_independent_payloads_are_never_taken_for_one():
 def test_the_first_frame_is_enough_where_half_of_it_is_right(right, frames):
     rng = np.random.default_rng(3)
     for _ in range(20):
-        images = [frame(1, n, misread(said(n), right, rng), light=70) for n in range(frames)]
+        images = [frame(1, n, misread(frame_content(n), right, rng), light=70) for n in range(frames)]
         assert echoes_of(*([frame(0, n), image] for n, image in enumerate(images))) == {1: 0}
 
 
 @pytest.mark.parametrize("clusters", [8, 6])
 def test_a_partial_reflection(clusters):
     """Only some clusters of the mirror image are seen: those are compared."""
-    part = said(0)
+    part = frame_content(0)
     part[: 16 - clusters] = -1
     assert echoes_of([frame(0, 0), frame(1, 0, part, light=70)]) == {1: 0}
     # As bright as the bar, whichever is first.
-    assert echoes_of([frame(0, 0, part), frame(1, 0, said(0))]) == {0: 1}
+    assert echoes_of([frame(0, 0, part), frame(1, 0, frame_content(0))]) == {0: 1}
     # What is hidden of the one is all that is seen of the other: nothing is known.
-    rest = np.where(part < 0, said(0), -1)
+    rest = np.where(part < 0, frame_content(0), -1)
     assert echoes_of([frame(0, 0, rest), frame(1, 0, part, light=70)]) == {}
 
 
@@ -101,7 +101,7 @@ def test_frames_at_other_times_are_not_compared():
 
 @pytest.mark.parametrize(("bar", "road", "rail"), list(permutations(range(3))))
 def test_a_bar_with_two_reflections(bar, road, rail):
-    """In whatever order they are numbered and come: both are known of the bar, none of the other."""
+    """In whatever order they are numbered and come: both are reflections of the bar, none of the other."""
     known = Reflections(FORMAT, CODEWORDS)
     for n in range(3):
         of_road = frame(road, n, late_us=30, y_px=450, light=130, mirrored=True)
@@ -110,7 +110,7 @@ def test_a_bar_with_two_reflections(bar, road, rail):
 
 
 def test_two_bars_with_a_reflection_each():
-    seen = [frame(k, 0, said(0, seed=k // 2), light=100 - 30 * (k % 2)) for k in range(4)]
+    seen = [frame(k, 0, frame_content(0, seed=k // 2), light=100 - 30 * (k % 2)) for k in range(4)]
     assert echoes_of(seen) == {1: 0, 3: 2}
 
 
@@ -162,7 +162,7 @@ def test_a_reflection_outlives_its_bar_by_a_second():
 def test_memory_is_bounded():
     known = Reflections(FORMAT, CODEWORDS)
     for n in range(2000):
-        known.add_detections([frame(k, n, said(n, seed=k), late_us=k) for k in (0, 1, 2 + n // 50)])
+        known.add_detections([frame(k, n, frame_content(n, seed=k), late_us=k) for k in (0, 1, 2 + n // 50)])
         assert sum(map(len, known._seen.values())) <= 4 * (3 * FORMAT.frames + 1)
         assert len(known._pairs) <= 3 + 2 * 8
 

@@ -27,16 +27,16 @@ def follower(spec=SPEC, **options):
     return RegionFollower(spec, CameraModel(), LINK.packet.chip_us, **options)
 
 
-def stepped(regions, events, until_us):
+def step_regions(regions, events, until_us):
     """The regions of each step, after its start, us."""
     return ((start, regions.step(start, part)) for start, part in steps(events, until_us))
 
 
-def followed(events, until_us, spec=SPEC):
-    return dict(stepped(follower(spec), events, until_us))
+def follow(events, until_us, spec=SPEC):
+    return dict(step_regions(follower(spec), events, until_us))
 
 
-def raised(events, by_px):
+def raise_events(events, by_px):
     return Events.of(events.t_us, events.x, events.y - by_px, events.p)
 
 
@@ -47,7 +47,7 @@ def in_order(t, x, y, p):
 def test_a_bar_is_found_within_three_steps_and_measured():
     """The events from before it was found are kept."""
     bar, events = lit(2, start_us=3000)
-    by_step = followed(events, 20_000)
+    by_step = follow(events, 20_000)
     assert next(start for start, found in by_step.items() if found) <= 3000 + 3 * STEP_US
     (region,) = by_step[19_000]
     assert (region.latest.x_px, region.latest.y_px) == pytest.approx(CENTRE, abs=0.6)
@@ -63,7 +63,7 @@ def test_a_bar_is_found_within_three_steps_and_measured():
 def test_a_shaking_bar_is_followed(shake_px, shake_hz):
     """1.5 px/ms is the most that the paper has seen."""
     bar, events = lit(3, shake_px=shake_px, shake_hz=shake_hz, start_us=0)
-    by_step = followed(events, 100_000)
+    by_step = follow(events, 100_000)
     assert {t.id for found in by_step.values() for t in found} == {0}
     (region,) = by_step[99_000]
     at = np.arange(5000.0, 99_000.0, 500.0)
@@ -82,7 +82,7 @@ def test_a_bar_that_leaves_the_image_fast_is_let_go(way):
     y = BAR_EVENTS.y + way[1] * moved_px
     on = (x >= 0) & (x < 1280) & (y >= 0) & (y < 720)
     seen = Events.of(*(column[on] for column in (BAR_EVENTS.t_us, x, y, BAR_EVENTS.p)))
-    found = [region for _, some in stepped(regions, seen, 160_000) for region in some]
+    found = [region for _, some in step_regions(regions, seen, 160_000) for region in some]
     assert found
     assert all(region.released for region in found)
     assert not regions.alive
@@ -94,7 +94,7 @@ def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_a
     hidden = (BAR_EVENTS.y >= 392) & (BAR_EVENTS.t_us < (30_000 if shows_again else 60_000))
     leaf = BAR_EVENTS[(BAR_EVENTS.x == 399) & (BAR_EVENTS.y < 306) & (BAR_EVENTS.t_us >= 15_000)]
     regions = follower()
-    for start, found in stepped(regions, merged(BAR_EVENTS[~hidden], raised(leaf, 9)), 60_000):
+    for start, found in step_regions(regions, merged(BAR_EVENTS[~hidden], raise_events(leaf, 9)), 60_000):
         if start == 12_000:
             (region,) = found
             regions.shape(region, ShownPlace(region.latest.t_us, CENTRE, SIZE, (-64.0, 32.0)))
@@ -105,13 +105,13 @@ def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_a
 @pytest.mark.parametrize("merge_px", [8, 15, 16, 32])
 def test_bars_farther_apart_than_the_gap_are_two_regions_for_every_gap(merge_px):
     events = merged(BAR_EVENTS, ideal_events(LINK, replace(BAR, x_px=500, start_us=5300)))
-    found = followed(events, 30_000, replace(SPEC, merge_px=merge_px))[29_000]
+    found = follow(events, 30_000, replace(SPEC, merge_px=merge_px))[29_000]
     assert sorted(round(t.latest.x_px) for t in found) == [400, 500]
 
 
 def test_what_fades_is_released():
     ends = 34_600
-    seen = stepped(follower(), BAR_EVENTS[BAR_EVENTS.t_us < ends], ends + SPEC.fade_us + 5000)
+    seen = step_regions(follower(), BAR_EVENTS[BAR_EVENTS.t_us < ends], ends + SPEC.fade_us + 5000)
     alive = {start: [not one.released for one in found] for start, found in seen}
     (gone,) = [start for start, found in alive.items() if found == [False]]
     assert gone == pytest.approx(ends + SPEC.fade_us, abs=2 * STEP_US)
@@ -123,7 +123,7 @@ def test_what_fades_is_released():
 )
 def test_lamps_and_noise_are_no_regions(hz, duty):
     lamp = lamp_events(300, 300, 20, hz, 60_000, duty=duty)
-    assert not any(followed(merged(lamp, noise_events(500_000, 60_000)), 60_000).values())
+    assert not any(follow(merged(lamp, noise_events(500_000, 60_000)), 60_000).values())
 
 
 def test_a_moving_edge_is_no_region():
@@ -131,7 +131,7 @@ def test_a_moving_edge_is_no_region():
     late_us = [0, 20, 40, 3000, 3020, 3040]
     column, row, late_us = np.meshgrid(np.arange(100, 400), np.arange(100, 500), late_us)
     columns = (column - 100) * 333 + late_us, column, row, late_us < 3000
-    assert not any(followed(in_order(*map(np.ravel, columns)), 100_000).values())
+    assert not any(follow(in_order(*map(np.ravel, columns)), 100_000).values())
 
 
 @pytest.mark.parametrize("jitter_us", [8, 16])
@@ -175,7 +175,7 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events():
     """Only the upper half is lit at first; the events of the whole come back from the image's."""
     kept = BAR_EVENTS[(BAR_EVENTS.y < 345) | (BAR_EVENTS.t_us >= 20_000)]
     regions = follower(keep_us=50_000)
-    *_, (_, (region, *_)) = stepped(regions, kept, 25_000)
+    *_, (_, (region, *_)) = step_regions(regions, kept, 25_000)
     before = sum(len(e) for _, e in region.pieces)
     assert regions.shape(region, ShownPlace(24_000.0, CENTRE, SIZE)) == np.inf
     assert region.positions.place_at(24_000.0) == pytest.approx(CENTRE)
@@ -196,7 +196,7 @@ def test_a_region_does_not_go_on_to_the_bar_below():
     below = CENTRE[0], CENTRE[1] + 132
     regions = follower()
     events = merged(BAR_EVENTS, ideal_events(LINK, replace(BAR, y_px=BAR.y_px + 132), seed=2))
-    for start, found in stepped(regions, events, 40_000):
+    for start, found in step_regions(regions, events, 40_000):
         if start == 10_000:
             (own,) = found
             t_us = own.latest.t_us
@@ -247,7 +247,7 @@ def test_the_part_of_a_box_that_is_clear_of_others(others, clear):
 
 def test_of_two_regions_that_follow_the_same_the_older_stays():
     regions = follower()
-    for start, found in stepped(regions, BAR_EVENTS, 15_000):
+    for start, found in step_regions(regions, BAR_EVENTS, 15_000):
         if start == 10_000:
             (first,) = found
             regions.shape(first, ShownPlace(first.latest.t_us, CENTRE, SIZE))

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from rx_streams import LINK, frames_of, received
+from rx_streams import LINK, frames_of, receive_cut
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.files import find_shipped_file
@@ -32,7 +32,7 @@ def recording():
     return read_events(find_shipped_file("recordings", "night-50m-30kmh-cut.raw"))
 
 
-def simulated(scene, **overrides):
+def simulate_scene(scene, **overrides):
     """A scene that is kept, or a preset's."""
     path = ROOT / "examples" / "scenes" / f"{scene}.toml"
     source = evlcp.simulate(load_scene(path if path.exists() else scene, overrides), seed=1)
@@ -56,42 +56,42 @@ SCENES = {
     ),
     "reflections": (
         LINK,
-        partial(simulated, "wet-road", duration_s=0.08),
+        partial(simulate_scene, "wet-road", duration_s=0.08),
         "46 54.5328 0.0460086 402.845 490.195 38453.8 26.1046 0.999912 26.6454 449.809 0.0754531 23",
     ),
     "dark LEDs and a drop": (
         LINK,
-        partial(simulated, "street", duration_s=0.06),
+        partial(simulate_scene, "street", duration_s=0.06),
         "17 59.563 0.0819455 418.259 390.439 27892.7 19.3954 0.95336 29.5588 404.332 0.113848 0",
     ),
     "a low sun": (
         LINK,
-        partial(simulated, "low-sun", duration_s=0.06),
+        partial(simulate_scene, "low-sun", duration_s=0.06),
         "17 41.7474 0.0201149 340.595 390.351 27871.5 30.6114 1 29.8088 365.473 0.0806984 0",
     ),
     "bars on all sides": (
         LINK,
-        partial(simulated, "portal", duration_s=0.06),
+        partial(simulate_scene, "portal", duration_s=0.06),
         "50 53.7483 0.0295534 586.604 374.916 27616 31.3872 0.999996 32.5737 480.76 0.0701108 0",
     ),
     "a panel": (
         resolve({"bar": PANEL}),
-        partial(simulated, "night", duration_s=0.07, link={"bar": PANEL}),
+        partial(simulate_scene, "night", duration_s=0.07, link={"bar": PANEL}),
         "19 49.7218 0.0906548 382.211 389.453 31459.2 31.558 1 29.7599 385.832 0.141631 0",
     ),
     "few pilots": (
         resolve(RAW),
-        partial(simulated, "night", duration_s=0.06, link=RAW),
+        partial(simulate_scene, "night", duration_s=0.06, link=RAW),
         "24 49.7518 0.0244647 382.115 390.766 30145.1 31.7202 1 120.01 386.464 0.0619525 0",
     ),
     "other codes": (
         resolve(NRZ),
-        partial(simulated, "night", duration_s=0.06, link=NRZ),
+        partial(simulate_scene, "night", duration_s=0.06, link=NRZ),
         "20 49.7339 0.0242951 382.303 390.347 27721.3 22.3601 0.977645 120.35 386.325 0.0958754 0",
     ),
     "motion feedback": (
         resolve(FEEDBACK),
-        partial(simulated, "fast-drive", duration_s=0.06),
+        partial(simulate_scene, "fast-drive", duration_s=0.06),
         "17 79.3063 0.0901196 422.41 420.693 27873.5 30.4477 1 29.8088 421.551 0.0681698 0",
     ),
 }
@@ -101,4 +101,4 @@ SCENES = {
 @pytest.mark.parametrize("scene", SCENES)
 def test_figures_are_those_of_before(scene):
     link, events, wanted = SCENES[scene]
-    assert figures(received(link, events())[1]) == pytest.approx([*map(float, wanted.split())], rel=1e-4)
+    assert figures(receive_cut(link, events())[1]) == pytest.approx([*map(float, wanted.split())], rel=1e-4)

@@ -4,7 +4,7 @@ from collections import Counter
 from dataclasses import replace
 
 import pytest
-from rx_streams import frames_of, lit, noise_events, received, right_frames, said
+from rx_streams import frame_content, frames_of, lit, noise_events, receive_cut, right_frames
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link, resolve
@@ -15,18 +15,18 @@ from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import replace_fields
 
 
-def named(name, **sections):
+def named_link(name, **sections):
     return replace(resolve(sections), name=name)
 
 
-BAR = named("bar")
-HALF = named("half", bar={"rows": 48})
-SLOW = named("slow", air={"chip_rate_hz": 5000.0})
-WH8 = named("wh8", modulation={"id": "wh8"})
+BAR = named_link("bar")
+HALF = named_link("half", bar={"rows": 48})
+SLOW = named_link("slow", air={"chip_rate_hz": 5000.0})
+WH8 = named_link("wh8", modulation={"id": "wh8"})
 LEFT, RIGHT = 300.3, 800.7
 
 
-def at(link, x_px, seconds=0.12, start_us=5000.0):
+def light_at(link, x_px, seconds=0.12, start_us=5000.0):
     """A transmitter at a column for some time, and its events."""
     packets = max(int(seconds * link.packet.chip_rate_hz / link.packet.packet_chips), 1)
     return lit(packets, int(x_px), link, x_px=x_px, start_us=start_us, cluster_px=4.0, width_px=2)
@@ -42,8 +42,8 @@ def right(packets, link, bar):
 
 @pytest.mark.parametrize("links", [(BAR, HALF), (WH8, BAR)], ids=lambda links: links[-1].name)
 def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(links):
-    (one, here), (two, there) = at(links[0], LEFT), at(links[1], RIGHT)
-    receiver, packets = received(list(links), merged(here, there))
+    (one, here), (two, there) = light_at(links[0], LEFT), light_at(links[1], RIGHT)
+    receiver, packets = receive_cut(list(links), merged(here, there))
     assert right(packets, links[0], one) == len(one.symbols) * 10
     assert right(packets, links[1], two) == len(two.symbols) * 10
     numbers = {p.transmitter: p.link for p in packets}
@@ -56,11 +56,11 @@ def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(links):
 
 
 def test_what_is_received_alone_is_the_same_with_another_link_beside():
-    events = merged(at(BAR, LEFT)[1], at(BAR, RIGHT)[1], noise_events(20_000, 120_000))
-    alone, single = received(BAR, events)
-    _, both = received([BAR, SLOW], events)
-    assert [said(replace_fields(f, link="bar")) for f in frames_of(single)] == [
-        said(f) for f in frames_of(both)
+    events = merged(light_at(BAR, LEFT)[1], light_at(BAR, RIGHT)[1], noise_events(20_000, 120_000))
+    alone, single = receive_cut(BAR, events)
+    _, both = receive_cut([BAR, SLOW], events)
+    assert [frame_content(replace_fields(f, link="bar")) for f in frames_of(single)] == [
+        frame_content(f) for f in frames_of(both)
     ]
     assert {p.link for p in single} == {""}
     assert {p.link for p in both} == {"bar"}
@@ -68,9 +68,9 @@ def test_what_is_received_alone_is_the_same_with_another_link_beside():
 
 
 def test_a_place_that_is_left_is_free_for_another_link():
-    one, first = at(BAR, LEFT, 0.1)
-    two, second = at(WH8, LEFT, 0.1, start_us=400_000.0)
-    packets = received([BAR, WH8], merged(first, second))[1]
+    one, first = light_at(BAR, LEFT, 0.1)
+    two, second = light_at(WH8, LEFT, 0.1, start_us=400_000.0)
+    packets = receive_cut([BAR, WH8], merged(first, second))[1]
     early = [p for p in packets if p.t_us < 300_000]
     late = [p for p in packets if p.t_us > 300_000]
     assert right(early, BAR, one) == len(one.symbols) * 10
@@ -83,8 +83,11 @@ def test_a_place_that_is_left_is_free_for_another_link():
         ([], "no link: expected one or more"),
         ([BAR, replace(WH8, name="bar")], "two links are named 'bar'"),
         ([BAR, replace(BAR, name="again")], "'bar' and 'again': they send alike"),
-        ([BAR, named("far", camera={"focal_mm": 50.0}, modulation={"id": "wh8"})], r"\[camera\] differs"),
-        ([BAR, named("fine", regions={"step_us": 1000}, modulation={"id": "wh8"})], "step_us = 1500"),
+        (
+            [BAR, named_link("far", camera={"focal_mm": 50.0}, modulation={"id": "wh8"})],
+            r"\[camera\] differs",
+        ),
+        ([BAR, named_link("fine", regions={"step_us": 1000}, modulation={"id": "wh8"})], "step_us = 1500"),
     ],
 )
 def test_links_that_cannot_be_received_together_are_refused(links, message):

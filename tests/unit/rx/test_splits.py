@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from rx_streams import LINK, frames_of, lit, noise_events, received, said
+from rx_streams import LINK, frame_content, frames_of, lit, noise_events, receive_cut
 
 from evlcp_sdk.files import find_shipped_file
 from evlcp_sdk.io import read_events
@@ -97,13 +97,15 @@ def test_any_split_gives_the_same(scene):
     slices = events.t_us.searchsorted(np.arange(1000, int(events.t_us[-1]), 1000))
     for cuts in ([], *random, slices):
         reports = []
-        receiver, packets = received(link, events, cuts, on_frame=reports.append, **options)
-        whole = [(p.t_us, p.chip_us, p.link, p.echo_of, [said(f) for f in p.frames]) for p in packets]
-        found.append(([said(frame) for frame in reports], whole, receiver.counts))
+        receiver, packets = receive_cut(link, events, cuts, on_frame=reports.append, **options)
+        whole = [
+            (p.t_us, p.chip_us, p.link, p.echo_of, [frame_content(f) for f in p.frames]) for p in packets
+        ]
+        found.append(([frame_content(frame) for frame in reports], whole, receiver.counts))
     assert found[1:] == found[:1] * 3
     counts = receiver.counts
     assert {name: counts[name] for name in least if counts[name] < least[name]} == {}
-    assert {said(f)[:-1] for f in frames_of(packets)} <= {said(f)[:-1] for f in reports}
+    assert {frame_content(f)[:-1] for f in frames_of(packets)} <= {frame_content(f)[:-1] for f in reports}
     assert len(reports) == counts["frames"] + counts["frames_at_end"] >= 9
     for number in {f.transmitter for f in reports}:
         order = [(f.packet, f.frame) for f in reports if f.transmitter == number]
@@ -116,7 +118,7 @@ def lateness(frames, events):
     return [float(events.t_us[fed - 1]) - frame.t_us - long_us for frame, fed in frames]
 
 
-def told_by_slices(links, events, slice_us):
+def frames_by_slices(links, events, slice_us):
     """Frames as they are told, each with how many events were fed by then."""
     cuts = events.t_us.searchsorted(np.arange(0, int(events.t_us[-1]), slice_us)).tolist()
     frames = []
@@ -128,7 +130,7 @@ def told_by_slices(links, events, slice_us):
 
 
 def test_a_frame_is_given_with_the_slice_that_ends_it():
-    frames = told_by_slices(LINK, BOTH, 250)
+    frames = frames_by_slices(LINK, BOTH, 250)
     # Those before the first lock have been there for long. Events are 20 to 30 us late; it waits half a chip.
     after = lateness([one for one in frames if one[0].packet > 0], BOTH)
     assert len(after) >= 36
@@ -139,7 +141,7 @@ def test_a_frame_is_given_with_the_slice_that_ends_it():
 def test_frames_from_before_the_first_lock_come_a_few_a_step():
     """Each step gives one frame that ends in it and two older ones, until none is left."""
     _, events = lit(2, start_us=-5_000)
-    frames = told_by_slices(LINK, events, LINK.regions.step_us)
+    frames = frames_by_slices(LINK, events, LINK.regions.step_us)
     a_slice = list(Counter(fed for _, fed in frames).values())
     assert a_slice[:3] == [3, 3, 3]
     # A slice may hold the end of one step and what is due in the next.
@@ -149,7 +151,7 @@ def test_frames_from_before_the_first_lock_come_a_few_a_step():
 
 def test_of_several_links_a_frame_comes_at_once_where_its_transmitter_holds_its_place():
     events = merged(lit(7, link=BAR, x_px=300.3)[1], lit(7, 1, link=WH8, x_px=800.7)[1])
-    frames = told_by_slices([BAR, WH8], events, 250)
+    frames = frames_by_slices([BAR, WH8], events, 250)
     assert Counter(frame.link for frame, _ in frames) == {"wh4x2": 70, "wh8": 70}
     late_us = [max(lateness([f for f in frames if f[0].packet == n], events)) for n in range(7)]
     # The first packets wait for their judgement, the last ones for nothing.

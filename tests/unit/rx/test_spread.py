@@ -52,7 +52,7 @@ def sharper(one, other):
     return compare(one, other)[0]
 
 
-def alike(one, other):
+def is_alike(one, other):
     return compare(one, other)[1]
 
 
@@ -91,7 +91,7 @@ def test_what_pixels_do_not_say_is_not_known():
     assert sharper(panel, panel) == pytest.approx(0)
 
 
-def dimmed(background, share, blur_px):
+def dim_background(background, share, blur_px):
     """Background in the light of an image of a share of the light, which blur spreads across the line."""
     return background / share * math.hypot(0.42, blur_px) / 0.42
 
@@ -99,10 +99,10 @@ def dimmed(background, share, blur_px):
 CASES = product((0.01, 0.03, 0.3), (0.1, 0.3, 0.6, 1.0), (0.0, 0.6, 1.0, 1.5))
 
 
-@pytest.mark.parametrize(("background", "share", "blur_px"), [c for c in CASES if dimmed(*c) < 2])
+@pytest.mark.parametrize(("background", "share", "blur_px"), [c for c in CASES if dim_background(*c) < 2])
 def test_the_sharper_and_brighter_one_is_the_bar(background, share, blur_px):
     (bar,) = expected_lengths(9.0, np.array([0.0]), [background])
-    (image,) = expected_lengths(9.0, np.array([blur_px]), [dimmed(background, share, blur_px)])
+    (image,) = expected_lengths(9.0, np.array([blur_px]), [dim_background(background, share, blur_px)])
     odds = [sharper(answering(bar, frames=n), answering(image, frames=n)) for n in (1, 10)]
     assert sharper(answering(image), answering(bar)) == pytest.approx(-odds[0])
     if blur_px or share < 1:
@@ -119,14 +119,14 @@ def test_two_bars_are_alike_and_images_are_not(background, farther):
     """Also where one is farther: its strip is narrower, and the light of a pixel less by as much."""
     (bar,) = expected_lengths(9.0, np.zeros(1), [background])
     (other,) = expected_lengths(9.0 / farther, np.zeros(1), [background * farther])
-    assert alike(answering(bar, frames=10), answering(other, 9.0 / farther, frames=10)) > 1.5
-    assert alike(answering(other, 9.0 / farther, 10), answering(bar, frames=10)) > 1.5
+    assert is_alike(answering(bar, frames=10), answering(other, 9.0 / farther, frames=10)) > 1.5
+    assert is_alike(answering(other, 9.0 / farther, 10), answering(bar, frames=10)) > 1.5
     # One of .7 of the light may be dirty, one of a third is a mirror.
     (weaker,) = expected_lengths(9.0, np.zeros(1), [background / 0.7])
-    assert alike(answering(bar, frames=10), answering(weaker, frames=10)) > 0
+    assert is_alike(answering(bar, frames=10), answering(weaker, frames=10)) > 0
     for share, blur_px in ((0.33, 0.0), (0.2, 0.0), (1.0, 1.0)):
-        (image,) = expected_lengths(9.0, np.array([blur_px]), [dimmed(background, share, blur_px)])
-        assert alike(answering(bar, frames=10), answering(image, frames=10)) < -0.5
+        (image,) = expected_lengths(9.0, np.array([blur_px]), [dim_background(background, share, blur_px)])
+        assert is_alike(answering(bar, frames=10), answering(image, frames=10)) < -0.5
 
 
 def test_a_blurred_image_in_a_window_is_not_the_bar():

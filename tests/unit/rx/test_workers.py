@@ -6,7 +6,7 @@ import signal
 from dataclasses import dataclass, replace
 
 import pytest
-from rx_streams import LINK, frames_of, lit, noise_events, received, said
+from rx_streams import LINK, frame_content, frames_of, lit, noise_events, receive_cut
 
 from evlcp_sdk.errors import ConfigError, PluginError, WorkerError
 from evlcp_sdk.link.resolve import load_link
@@ -41,9 +41,9 @@ def test_the_same_whoever_decodes(monkeypatch):
         outcomes = []
         for many in (1, 3):
             reports = []
-            receiver, packets = received(link, EVENTS, (40_000,), on_frame=reports.append, workers=many)
-            frames = [(p.t_us, p.link, p.echo_of, [said(f) for f in p.frames]) for p in packets]
-            outcomes.append((frames, receiver.counts, sorted(said(f)[1:] for f in reports)))
+            receiver, packets = receive_cut(link, EVENTS, (40_000,), on_frame=reports.append, workers=many)
+            frames = [(p.t_us, p.link, p.echo_of, [frame_content(f) for f in p.frames]) for p in packets]
+            outcomes.append((frames, receiver.counts, sorted(frame_content(f)[1:] for f in reports)))
         assert outcomes[0] == outcomes[1]
         assert len(frames_of(packets)) >= 50
     assert not any(child.name in ("worker 1", "worker 2") for child in multiprocessing.active_children())
@@ -73,7 +73,7 @@ def test_what_fails_in_a_worker_is_named():
     broken = LINK.with_algorithm("ranging", Broken(), id="broken")
     for many in (1, 2):
         with pytest.raises(PluginError, match=r"^ranging algorithm .broken.: ZeroDivisionError: boom"):
-            received(broken, EVENTS, workers=many)
+            receive_cut(broken, EVENTS, workers=many)
 
 
 def test_what_cannot_be():

@@ -22,7 +22,7 @@ def moving_log() -> AttitudeLog:
     # Clockwise as seen from above: downward, right-handed.
     turns = (heading_deg(T_S + 1e-4) - heading_deg(T_S - 1e-4)) / 2e-4
     rates = [at.T @ [0.0, 0.0, -turn] for at, turn in zip(axes, turns, strict=True)]
-    forces = [at.T @ (pushed_enu(t) + GRAVITY) for at, t in zip(axes, T_S, strict=True)]
+    forces = [at.T @ (acceleration_enu(t) + GRAVITY) for at, t in zip(axes, T_S, strict=True)]
     still = 0 * T_S
     angles = T_S * 1e6, still + 7.0, still - 12.0, None, still, still
     return AttitudeLog(*angles, rates_deg_s=np.array(rates), forces_m_s2=np.array(forces))
@@ -32,7 +32,7 @@ def heading_deg(t: Floats | float) -> Floats:
     return np.asarray(350 + 20 * t + 15 * np.sin(2 * t))
 
 
-def pushed_enu(t: float) -> Floats:
+def acceleration_enu(t: float) -> Floats:
     return np.array([np.sin(t), 0.3 * t, -0.2])
 
 
@@ -47,7 +47,7 @@ def test_turn_and_push_of_a_tilted_camera() -> None:
     np.testing.assert_allclose(found.turn_rad, turned, atol=1e-4)
     for k in range(0, len(found.t_s), 50):
         heading = np.radians(heading_deg(start + found.t_s[k]))
-        east, north, up = pushed_enu(start + found.t_s[k])
+        east, north, up = acceleration_enu(start + found.t_s[k])
         right, forward = np.cos(heading), np.sin(heading)
         own = [east * right - north * forward, east * forward + north * right, up]
         np.testing.assert_allclose(found.acceleration_m_s2[k], own, atol=2e-3)

@@ -124,7 +124,7 @@ CAMERA = CameraModel()
 SIGMA_PX = np.full(16, 0.1)
 
 
-def seen(
+def image_of_bar(
     attitude: Attitude, east: float, up: float, axis: tuple[float, float, float], camera: CameraModel = CAMERA
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Where 16 clusters of a bar are seen 50 m to the north, its depth, and its direction (camera's axes)."""
@@ -142,7 +142,7 @@ PLUMB = (0.0, 0.0, -1.0)
 @pytest.mark.parametrize("axis", [PLUMB, (0.0, 0.0, 1.0)], ids=["upright", "upside-down"])
 def test_a_plumb_bar(pitch_deg, roll_deg, east, up, axis) -> None:
     attitude = Attitude(pitch_deg, roll_deg, 0.0)
-    points, depth_m, direction = seen(attitude, east, up, axis)
+    points, depth_m, direction = image_of_bar(attitude, east, up, axis)
     sight = line_of_sight(CAMERA, points, SIGMA_PX, attitude)
     assert not sight.askew
     assert sight.tilt_sine == pytest.approx(-direction[2], abs=1e-12)
@@ -162,7 +162,7 @@ def foreshortening(sine: float, along: float, across: float) -> float:
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.05, 0.0, -1.0), (-0.02, 0.0, 1.0)])
 def test_a_bar_that_stands_otherwise_is_askew(axis: tuple[float, float, float]) -> None:
     attitude = Attitude(4.0, 0.0)
-    points, _, _ = seen(attitude, 1.0, 0.5, axis)
+    points, _, _ = image_of_bar(attitude, 1.0, 0.5, axis)
     sight = line_of_sight(CAMERA, points, SIGMA_PX, attitude)
     assert sight.askew
     assert sight.tilt_sine is None
@@ -173,7 +173,7 @@ def test_a_bar_that_stands_otherwise_is_askew(axis: tuple[float, float, float]) 
 
 
 def test_the_sigma_is_that_of_gravity_and_of_plumb_bars() -> None:
-    points, _, _ = seen(Attitude(30.0, 0.0, 0.0), 0.0, 29.0, PLUMB)
+    points, _, _ = image_of_bar(Attitude(30.0, 0.0, 0.0), 0.0, 29.0, PLUMB)
     sight = line_of_sight(CAMERA, points, SIGMA_PX, Attitude(30.0, 0.0, gravity_sigma_deg=0.2))
     assert sight.tilt_sine == pytest.approx(0.5)
     assert sight.tilt_sigma == pytest.approx(math.radians(math.hypot(0.2, 0.1)) * math.cos(math.radians(30)))
@@ -206,7 +206,7 @@ def test_distances_and_curvatures_of_a_distorted_bar_are_those_of_a_pinhole(corn
 
 def test_a_part_of_a_bar_has_a_line_of_sight_and_a_point_has_none() -> None:
     attitude = Attitude(4.0, 0.0)
-    points, _, direction = seen(attitude, 1.0, 3.0, PLUMB)
+    points, _, direction = image_of_bar(attitude, 1.0, 3.0, PLUMB)
     points[[0, 1, 2, 9]] = np.nan
     assert line_of_sight(CAMERA, points, SIGMA_PX, attitude).tilt_sine == pytest.approx(-direction[2])
     unknown = line_of_sight(CAMERA, points, SIGMA_PX)

@@ -34,13 +34,13 @@ def rows(events: Events) -> list[tuple[int, int, int, int]]:
     return sorted(zip(*(c.tolist() for c in columns), strict=True))
 
 
-def alike(one: Events, two: Events) -> None:
+def check_alike(one: Events, two: Events) -> None:
     """But for crossings at the turn of a microsecond, which the rounding of sums moves."""
     a, b = set(rows(one)), set(rows(two))
     assert min(len(a), len(b)) > 5000
     assert len(a & b) > 0.999 * max(len(a), len(b))
 
 
-def still(duration_s: float, **parts: object) -> Scene:
+def still_scene(duration_s: float, **parts: object) -> Scene:
     """A scene without noise or motion."""
     return replace(Scene(duration_s=duration_s, sensor=EXACT, motion=STILL), **parts)  # type: ignore[arg-type]

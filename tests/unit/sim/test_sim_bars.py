@@ -27,7 +27,7 @@ from evlcp_sdk.simulated import simulate
 from evlcp_sdk.study.measure import message_tallies
 from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.values import Packet
-from tests.unit.sim.scenes import every, still
+from tests.unit.sim.scenes import every, still_scene
 
 PANEL = {"rows": 16, "columns": 16, "led_pitch_m": 0.02, "cluster_rows": 4, "cluster_columns": 4}
 
@@ -53,7 +53,7 @@ def test_a_bar_lays_its_tables_over_the_scene_s(tmp_path: Path) -> None:
     assert links_of(resolve_scene(truth_of(scene).table["simulator"])) == links_of(scene)
 
 
-def turned(bar: BarSpec, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def turn_points(bar: BarSpec, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points (x right, y down, z towards the camera) in the scene, by matrices: tilted, then leaned."""
     tilt, lean = math.radians(bar.tilt_deg), math.radians(bar.lean_deg)
     back = np.array([[1, 0, 0], [0, math.cos(tilt), math.sin(tilt)], [0, -math.sin(tilt), math.cos(tilt)]])
@@ -86,8 +86,8 @@ def test_a_cluster_of_any_layout_blinks_where_a_pinhole_shows_it(layout, cluster
         x_m=0.5, lean_deg=15.0, tilt_deg=20.0, link={"bar": layout}, chips_file=str(tmp_path / "chips.npy")
     )
     camera = CameraModel()
-    events = every(still(0.01, lens=LensSpec(wings=False), bars=(bar,)))
-    x, y, z = (turned(bar, link.bar.led_positions_m())[link.bar.led_clusters() == cluster]).T
+    events = every(still_scene(0.01, lens=LensSpec(wings=False), bars=(bar,)))
+    x, y, z = (turn_points(bar, link.bar.led_positions_m())[link.bar.led_clusters() == cluster]).T
     u, v = (camera.focal_px * a / (z + 50.0) + c for a, c in zip((x, y), camera.centre_px, strict=True))
     pixels = np.unique(np.stack([events.x, events.y], 1), axis=0)
     assert pixels.mean(0) == pytest.approx([u.mean(), v.mean()], abs=0.4)

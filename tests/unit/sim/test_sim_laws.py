@@ -20,7 +20,7 @@ from evlcp_sdk.sim import (
 )
 from evlcp_sdk.values import Events
 from tests.models.truths import scene_of_truth
-from tests.unit.sim.scenes import every, rows, still
+from tests.unit.sim.scenes import every, rows, still_scene
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
 SHORT = replace(load_scene("two-bars"), duration_s=0.03, lamps=(LampSpec(x_m=-1.4, y_m=-0.6, z_m=3.0),))
@@ -50,9 +50,9 @@ def test_the_clock_shifts_all_stamps() -> None:
 
 
 def test_dark_and_passed_bars_give_nothing() -> None:
-    dark = still(0.02, bars=(BarSpec(led_w_m2=1e-9),))
+    dark = still_scene(0.02, bars=(BarSpec(led_w_m2=1e-9),))
     assert len(every(dark)) == 0
-    passing = still(
+    passing = still_scene(
         0.1,
         camera=CameraModel(width=160, height=120, focal_mm=1.0),
         motion=MotionSpec(distance_m=1.2, speed_mps=30.0, yaw_deg=-50.0, vib_rate_rad_s=0.0),

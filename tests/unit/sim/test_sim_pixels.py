@@ -12,7 +12,7 @@ from evlcp_sdk.sim import Scene, SensorSpec, _kernels
 from evlcp_sdk.sim.simulation import quantile_table, request_words, seed_key
 from evlcp_sdk.values import Events
 from tests.models import pixels as model
-from tests.models.pixels import pixel_events, served, words_of
+from tests.models.pixels import pixel_events, serve_requests, words_of
 from tests.unit.sim.scenes import every
 
 SENSOR = SensorSpec()
@@ -142,7 +142,7 @@ def test_latency_grows_with_the_lit_area(side: int) -> None:
 
 def test_columns_of_the_widest_sensor_are_distinguished() -> None:
     words = words_of(np.full(4, 10.0), [719, 718, 718, 719], [8191, 0, 4096, 1])
-    events, *_ = served(words, 720, 1.0)
+    events, *_ = serve_requests(words, 720, 1.0)
     assert events.x.tolist() == [0, 4096, 1, 8191]
     assert events.y.tolist() == [718, 718, 719, 719]
 
@@ -150,7 +150,7 @@ def test_columns_of_the_widest_sensor_are_distinguished() -> None:
 def test_more_than_the_event_rate_limit_is_dropped() -> None:
     t = np.sort(np.random.default_rng(0).uniform(0, 1000, 5000))
     words = words_of(t, np.arange(5000) % 700, np.arange(5000) // 700)
-    events, dropped, *_ = served(words, 720, 0.0, limit=(300, 200))
+    events, dropped, *_ = serve_requests(words, 720, 0.0, limit=(300, 200))
     assert len(events) + dropped == 5000
     assert np.bincount(events.t_us // 200).max() == 300
     assert dropped == 5000 - 5 * 300

@@ -34,8 +34,8 @@ from evlcp_sdk.sim.light import BarLight, Source, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
 from evlcp_sdk.sim.scene import LensSpec
 from evlcp_sdk.values import Events
-from tests.models.pixels import served, words_of
-from tests.unit.sim.scenes import EXACT, STILL, alike, every, rows, still
+from tests.models.pixels import serve_requests, words_of
+from tests.unit.sim.scenes import EXACT, STILL, check_alike, every, rows, still_scene
 
 EVEN = BackgroundSpec(light_w_m2=0.3, texture=0.0)
 FOCAL_PX = Scene().camera.focal_px
@@ -59,9 +59,9 @@ def test_an_image_is_a_dimmer_bar_at_another_place(image, place, tmp_path, monke
     np.save("chips.npy", sent)
     np.save("upside-down.npy", sent[:, ::-1])
     first = BarSpec(chips_file="chips.npy", start_chip=0.0, led_w_m2=40.0)
-    scene = still(0.01, background=EVEN, bars=(first,))
+    scene = still_scene(0.01, background=EVEN, bars=(first,))
     second = replace(first, led_w_m2=10.0, **place)
-    alike(every(replace(scene, reflections=(image,))), every(replace(scene, bars=(first, second))))
+    check_alike(every(replace(scene, reflections=(image,))), every(replace(scene, bars=(first, second))))
 
 
 def test_a_window_turns_the_light() -> None:
@@ -149,7 +149,7 @@ def test_a_drop_bends_what_is_seen_through_it() -> None:
     for dx, dy in ((10.0, 0.0), (-12.0, 16.0), (0.0, 2.0)):
         x, y = (660.0 - 640 + dx) * 50 / FOCAL_PX, (350.0 - 360 + dy) * 50 / FOCAL_PX
         lamp = LampSpec(x, y, 0.0, 0.005, 0.005, flicker_hz=1000.0)
-        events = every(still(0.0039, background=EVEN, bars=(), lamps=(lamp,), drops=(drop,)))
+        events = every(still_scene(0.0039, background=EVEN, bars=(), lamps=(lamp,), drops=(drop,)))
         # Where the formula puts it, by iteration: in the first 4 ms the drop is 1 px farther on.
         seen = at = np.array([dx - 1.0, dy]) / 20
         for _ in range(200):
@@ -163,7 +163,7 @@ def test_background_that_changes_gives_the_events_of_its_contrast() -> None:
         light_w_m2=0.1, texture=0.0, change_s=((0.004, 1.0), (0.014, 300.0), (0.016, 30.0)), around_px=40
     )
     camera = CameraModel(width=40, height=4)
-    events = every(still(0.03, camera=camera, background=background, bars=()))
+    events = every(still_scene(0.03, camera=camera, background=background, bars=()))
     rising, falling = events[events.p == 1], events[events.p == 0]
     # A pixel forgets what the light rises by while it is blind, 10 us, and a dark one is late.
     each_us = 0.223 / math.log(300) * 10_000 + 10
@@ -220,7 +220,7 @@ def test_a_pothole_strikes_rings_and_decays() -> None:
     assert np.diff(place[:, 1])[50] == pytest.approx(0.8 * FOCAL_PX / 1000, rel=0.03)
 
 
-def panned(tmp_path: Path, **background: Any) -> Scene:
+def panning_scene(tmp_path: Path, **background: Any) -> Scene:
     """A camera that turns to the right by 0.3 degrees in 40 ms, and then rests."""
     lines = ["t_s,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg"]
     lines += [f"{t},0,0,-50,{min(t, 0.04) * 7.5},0,0" for t in np.arange(0, 0.0601, 0.002)]
@@ -237,7 +237,7 @@ def panned(tmp_path: Path, **background: Any) -> Scene:
 
 
 def test_texture_that_moves_gives_the_events_of_its_own_contrast(tmp_path: Path) -> None:
-    scene = panned(tmp_path, texture=0.8, texture_px=8.0, texture_step_px=0.1, around_px=160)
+    scene = panning_scene(tmp_path, texture=0.8, texture_px=8.0, texture_step_px=0.1, around_px=160)
     simulation = Simulation(scene)
     events = Events.concat(list(simulation.stream()))
     net, count = np.zeros((2, 100, 160))
@@ -256,7 +256,7 @@ def test_texture_that_moves_gives_the_events_of_its_own_contrast(tmp_path: Path)
 
 
 def test_background_is_simulated_around_the_sources() -> None:
-    scene = still(
+    scene = still_scene(
         0.02,
         motion=replace(STILL, vib_rate_rad_s=0.3),
         background=BackgroundSpec(3.0, texture=1.0, texture_px=4.0, around_px=60, texture_step_px=0.2),
@@ -296,7 +296,7 @@ def test_all_that_a_road_adds_does_not_depend_on_threads_or_length() -> None:
     assert resolve_scene(json.loads(json.dumps(asdict(scene)))) == scene
 
 
-def held_by_hand(t: Floats, y: Floats, x: Floats, row_us: float) -> list[tuple[int, int, int]]:
+def held_twin(t: Floats, y: Floats, x: Floats, row_us: float) -> list[tuple[int, int, int]]:
     """Row after row, a plain loop: a pixel's request that comes while one of it waits is not there."""
     todo, waiting, found = list(zip(t.tolist(), y.tolist(), x.tolist(), strict=True)), {}, []
     free, row = 0.0, -1
@@ -318,7 +318,7 @@ def test_a_pixel_that_waits_for_the_readout_sends_no_other() -> None:
     rng = np.random.default_rng(4)
     t = np.sort(rng.uniform(0, 400, 3000))
     y, x = rng.integers(0, 30, 3000), rng.integers(0, 6, 3000)
-    want = held_by_hand(t, y, x, 1.3)
+    want = held_twin(t, y, x, 1.3)
     assert 500 < len(want) < 2500
     for cuts in ([math.inf], [100.0, 101.5, 260.0, math.inf]):
         memory, pending, found, blind = np.array([-1e18, -1.0, -1.0, 0.0]), np.zeros((30, 8), bool), [], 0
@@ -327,7 +327,9 @@ def test_a_pixel_that_waits_for_the_readout_sends_no_other() -> None:
         for safe in cuts:
             new = (t >= before) & (t < safe)
             before, rest = safe, np.concatenate([rest, words[new]])
-            events, _, held, left = served(rest, 30, 1.3, until_us=safe, memory=memory, pending=pending)
+            events, _, held, left = serve_requests(
+                rest, 30, 1.3, until_us=safe, memory=memory, pending=pending
+            )
             rest, blind = rest[:left], blind + held
             found += list(zip(events.t_us.tolist(), events.y.tolist(), events.x.tolist(), strict=True))
             assert not pending.any()

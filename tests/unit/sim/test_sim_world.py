@@ -24,7 +24,7 @@ BARS = [
 SCENE = resolve_scene({"duration_s": 0.02, "world": WORLD, "motion": MOTION, "bars": BARS})
 
 
-def turned(*degrees: float) -> np.ndarray:
+def camera_axes(*degrees: float) -> np.ndarray:
     """Rows: the camera's right, down and ahead in east, north, up, from the attitude's definition."""
     h, p, r = np.radians(degrees)
     ahead = np.array([np.sin(h) * np.cos(p), np.cos(h) * np.cos(p), np.sin(p)])
@@ -43,7 +43,7 @@ def test_sites_and_camera_say_what_the_image_shows() -> None:
     camera = SCENE.camera
     for i in (0, 19):
         local = LocalAxes(*(path[key][i] for key in ("latitude_deg", "longitude_deg", "height_m")))
-        axes = turned(*(path[key][i] for key in ("heading_deg", "pitch_deg", "roll_deg")))
+        axes = camera_axes(*(path[key][i] for key in ("heading_deg", "pitch_deg", "roll_deg")))
         position, attitude = simulation.path.at(truth["t_s"][i] * 1e6)
         for site, light in zip(sites, simulation.bars, strict=True):
             seen = camera.project(site.cluster_positions_m(16, local) @ axes.T)

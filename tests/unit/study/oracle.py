@@ -46,7 +46,9 @@ def at(t_us: float, truth: dict[str, Any], values: list[float]) -> float:
     return float(np.interp(t_us, np.array(truth["t_s"]) * 1e6, values))
 
 
-def hidden(bar: dict[str, Any], clusters: int, begin: float, end: float, recovery: float) -> tuple[set, set]:
+def hidden_clusters(
+    bar: dict[str, Any], clusters: int, begin: float, end: float, recovery: float
+) -> tuple[set, set]:
     """Clusters that are hidden from begin to end, and at any time of it."""
     whole, part = set(bar.get("covered", ())), set(bar.get("covered", ()))
     poles = [(a, b, 0, clusters - 1) for a, b in bar.get("pole_s", ())]
@@ -74,7 +76,9 @@ def score(rows: list[Row], truth: dict[str, Any], lengths: Lengths, *, road: boo
             for f, (first, chips) in enumerate(lengths.frames(len(packet))):
                 begin = (q * lengths.packet(len(packet)) + first - bar["start_chip"]) / rate * 1e6
                 end = begin + chips / rate * 1e6
-                whole, part = hidden(bar, len(packet[f]), begin, end, 3 * chip) if road else (set(), set())
+                whole, part = (
+                    hidden_clusters(bar, len(packet[f]), begin, end, 3 * chip) if road else (set(), set())
+                )
                 if begin >= 0 and end + tail < duration and len(part) < len(packet[f]):
                     middle = (lengths.pilot if chips > lengths.info else lengths.info) / 2 * chip
                     true_m = at(begin + middle, truth, truth["distance_m"][i])

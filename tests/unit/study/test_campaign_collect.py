@@ -24,7 +24,7 @@ from tests.unit.study.fake import fake_plan, run_fake
 from tests.unit.test_signals import start
 
 
-def collected(plan, path, executor=None, watch=lambda _: None) -> tuple[Progress, list[Statistics]]:
+def collect_plan(plan, path, executor=None, watch=lambda _: None) -> tuple[Progress, list[Statistics]]:
     """How a collection ended, and what counts of each point in its store."""
     with Store(path, create=True) as store:
         progress = collect(plan, store, executor or Inline(), run_fake, watch)
@@ -35,8 +35,8 @@ def collected(plan, path, executor=None, watch=lambda _: None) -> tuple[Progress
 @pytest.mark.parametrize("rule", [StopRule(), StopRule(max_bits=9000, max_errors=60)])
 def test_the_number_of_workers_changes_nothing(tmp_path: Path, rule: StopRule) -> None:
     plan = fake_plan(seeds=8, rule=rule)
-    one, expected = collected(plan, tmp_path / "one.sqlite")
-    many, totals = collected(plan, tmp_path / "many.sqlite", Processes(3))
+    one, expected = collect_plan(plan, tmp_path / "one.sqlite")
+    many, totals = collect_plan(plan, tmp_path / "many.sqlite", Processes(3))
     assert totals == expected
     assert one == many
     assert one.done == one.tasks
@@ -70,12 +70,12 @@ def test_a_finished_campaign_runs_nothing_and_a_grown_one_the_rest(tmp_path: Pat
     assert len(ran) == len(set(ran)) == 60
     # A rule that is tightened counts less of what is there.
     plan = fake_plan(rule=StopRule(max_bits=2500))
-    assert collected(plan, tmp_path / "a.sqlite")[1] == collected(plan, tmp_path / "b.sqlite")[1]
+    assert collect_plan(plan, tmp_path / "a.sqlite")[1] == collect_plan(plan, tmp_path / "b.sqlite")[1]
 
 
 @pytest.mark.parametrize("executor", [Inline(), Processes(2)], ids=["inline", "processes"])
 def test_a_job_that_fails_does_not_stop_the_others(tmp_path: Path, executor: Executor) -> None:
-    progress, totals = collected(fake_plan(fails=1, breaks=3), tmp_path / "a.sqlite", executor)
+    progress, totals = collect_plan(fake_plan(fails=1, breaks=3), tmp_path / "a.sqlite", executor)
     messages = {job.scene["n"]: fault.message for job, fault in progress.faults}
     assert messages.keys() == {1, 3}
     assert messages[1] == "this scene cannot be rendered"
@@ -88,13 +88,13 @@ def test_a_job_that_fails_does_not_stop_the_others(tmp_path: Path, executor: Exe
 
 def test_a_worker_that_dies_is_replaced(tmp_path: Path) -> None:
     plan = fake_plan(seeds=1, dies_once=str(tmp_path / "mark"))
-    progress, totals = collected(plan, tmp_path / "a.sqlite", Processes(2))
+    progress, totals = collect_plan(plan, tmp_path / "a.sqlite", Processes(2))
     assert not progress.faults
-    assert totals == collected(fake_plan(seeds=1), tmp_path / "b.sqlite")[1]
+    assert totals == collect_plan(fake_plan(seeds=1), tmp_path / "b.sqlite")[1]
 
 
 def test_a_job_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
-    progress, _ = collected(fake_plan(scenes=3, seeds=1, dies=1), tmp_path / "a.sqlite", Processes(2))
+    progress, _ = collect_plan(fake_plan(scenes=3, seeds=1, dies=1), tmp_path / "a.sqlite", Processes(2))
     ((job, fault),) = progress.faults
     assert job.scene["n"] == 1
     assert fault.message == "its process died 3 times"
@@ -106,7 +106,7 @@ def begin(store: Path) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, cwd=ROOT, start_new_session=True)
 
 
-def kept(store: Path) -> int:
+def count_kept(store: Path) -> int:
     if not store.exists():
         return 0
     try:
@@ -129,7 +129,7 @@ def test_killed_it_ends_as_if_never(tmp_path: Path) -> None:
     store, plan = tmp_path / "killed.sqlite", fake_plan(8, 2, 4)
     process = begin(store)
     try:
-        before = wait_for(lambda: kept(store), 10)
+        before = wait_for(lambda: count_kept(store), 10)
         workers = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     finally:
         process.kill()
@@ -137,11 +137,11 @@ def test_killed_it_ends_as_if_never(tmp_path: Path) -> None:
     for worker in workers:
         wait_for(lambda w=worker: int(not Path(f"/proc/{w}").exists()), 0)
         assert not Path(f"/proc/{worker}/exe").exists(), "a worker outlives its scheduler"
-    assert 10 < before <= kept(store) < 64
+    assert 10 < before <= count_kept(store) < 64
     assert len(workers) >= 2
     assert begin(store).wait(60) == 0
-    assert kept(store) == 64
-    assert collected(plan, store) == collected(plan, tmp_path / "whole.sqlite")
+    assert count_kept(store) == 64
+    assert collect_plan(plan, store) == collect_plan(plan, tmp_path / "whole.sqlite")
 
 
 def test_what_is_no_store_or_cannot_be_opened_is_refused(tmp_path: Path) -> None:
@@ -205,10 +205,10 @@ def test_workers_may_die_and_come(cluster: Cluster, tmp_path: Path) -> None:
             cluster.processes[1].kill()
             cluster.add_worker()
 
-    progress, totals = collected(plan, tmp_path / "a.sqlite", DaskCluster(cluster.address), watch)
+    progress, totals = collect_plan(plan, tmp_path / "a.sqlite", DaskCluster(cluster.address), watch)
     assert len(cluster.processes) == 4
     assert (progress.faults, progress.done) == ((), 64)
-    assert totals == collected(fake_plan(8, 2, 4), tmp_path / "b.sqlite")[1]
+    assert totals == collect_plan(fake_plan(8, 2, 4), tmp_path / "b.sqlite")[1]
 
 
 def test_a_scheduler_that_dies_keeps_what_was_finished(cluster: Cluster, tmp_path: Path) -> None:
@@ -220,9 +220,9 @@ def test_a_scheduler_that_dies_keeps_what_was_finished(cluster: Cluster, tmp_pat
             cluster.processes[0].kill()
 
     with pytest.raises(EvlcpError, match="scheduler is gone; what was finished is kept") as caught:
-        collected(plan, tmp_path / "a.sqlite", DaskCluster(cluster.address), watch)
+        collect_plan(plan, tmp_path / "a.sqlite", DaskCluster(cluster.address), watch)
     assert len(str(caught.value).splitlines()) == 1
-    assert kept(tmp_path / "a.sqlite") >= 40
+    assert count_kept(tmp_path / "a.sqlite") >= 40
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense", "tcp://127.0.0.1", "nonsense://x:1"])

@@ -32,7 +32,7 @@ distance_m = [90.0, 60.0, 30.0]
 """
 
 
-def made(base: str | None, overrides: Sequence[str]) -> Case:
+def make_case(base: str | None, overrides: Sequence[str]) -> Case:
     if any(o.startswith("wrong=") for o in overrides):
         raise ConfigError("wrong: unknown key\nand more")
     identity = {"base": base and Path(base).name, "set": list(overrides)}
@@ -42,7 +42,7 @@ def made(base: str | None, overrides: Sequence[str]) -> Case:
 def plan_of(tmp_path: Path, text: str = TEXT, overrides: Sequence[str] = (), environment: Any = None) -> Plan:
     path = tmp_path / "c.toml"
     path.write_text(text)
-    return load_plan(path, made, made, environment or {}, overrides)
+    return load_plan(path, make_case, make_case, environment or {}, overrides)
 
 
 def test_a_grid_with_variants(tmp_path: Path) -> None:

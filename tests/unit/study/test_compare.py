@@ -42,7 +42,7 @@ ERRORS = errors(0.1, -0.2, 0.6)
 FILTERED = Tally(filtered=2, filtered_squares_nm2=29 * 10**14)
 
 
-def measured(error=ERRORS, filtered=FILTERED, times=None, **changes: int) -> Measured:
+def make_measured(error=ERRORS, filtered=FILTERED, times=None, **changes: int) -> Measured:
     """A variant with truth and a tracking filter."""
     tally = Tally(**({"frames_sent": 100, "frames_found": 88, "bits": 8448, "bit_errors": 3} | changes))
     counts = {"packets": 9, "rows": 90, "unmatched": 2, "stated": 2, "sigma_squares_nm2": 10**17}
@@ -68,12 +68,12 @@ def comparison(*tables: Table) -> Comparison:
 
 
 def test_figures_by_hand() -> None:
-    m = measured()
+    m = make_measured()
     assert (m.ber.value, m.ber.recordings) == (3 / 8448, 1)
     assert math.isnan(m.ber.high)
     assert m.tally.rmse_m == pytest.approx(math.sqrt((0.01 + 0.04 + 0.36) / 3))
     assert (m.us_per_frame, m.times_real_time, m.tally.found_share) == (700, 2, 0.88)
-    both = m + measured(bit_errors=5)
+    both = m + make_measured(bit_errors=5)
     assert (both.tally.bits, both.tally.bit_errors) == (16896, 8)
     assert (both.statistics.packets, both.statistics.rows) == (18, 180)
     assert both.times.frame_us == m.times.frame_us * 2
@@ -84,17 +84,17 @@ def test_figures_by_hand() -> None:
 
 
 def test_the_best_are_marked() -> None:
-    other = measured(errors(-0.2, 0.15, 0.7), times={"frame_us": (800.0,), "cpu_s": 0.1}, bit_errors=2)
-    best = table(measured(errors(0.5, -0.6, 0.0)), other).best()
+    other = make_measured(errors(-0.2, 0.15, 0.7), times={"frame_us": (800.0,), "cpu_s": 0.1}, bit_errors=2)
+    best = table(make_measured(errors(0.5, -0.6, 0.0)), other).best()
     # As many frames: both. BER by its value: the intervals of 2 and 3 errors overlap.
     shared = {"found_share", "filtered_rmse_m"}
     assert best[0] == shared | {"us_per_frame", "bias_m"}
     assert best[1] == shared | {"ber", "rmse_m", "gross_share", "times_real_time"}
     # Two have a BER, only one has distances.
-    alone, other_keys = table(measured(), measured(Tally(), Tally())).best()
+    alone, other_keys = table(make_measured(), make_measured(Tally(), Tally())).best()
     assert "ber" in alone & other_keys
     assert not (alone | other_keys) & {"rmse_m", "bias_m", "gross_share", "filtered_rmse_m"}
-    assert table(measured()).best() == (frozenset(),)
+    assert table(make_measured()).best() == (frozenset(),)
     assert table(BLIND, BLIND).best() == (frozenset({"times_real_time"}),) * 2
 
 
@@ -105,7 +105,7 @@ def rows_of(one: Table) -> list[dict[str, str]]:
 
 
 def test_cells() -> None:
-    some, no_errors, bound = rows_of(table(measured(), measured(bit_errors=0)))
+    some, no_errors, bound = rows_of(table(make_measured(), make_measured(bit_errors=0)))
     assert some["frames"] == "88/100*"
     # One recording has no interval, but a limit where there is no error: 0 of 88 frames.
     assert (some["95 %"], no_errors["BER"], no_errors["95 %"]) == ("-", "0*", "< 4.1e-02")
@@ -113,29 +113,29 @@ def test_cells() -> None:
     assert bound == dict.fromkeys(some, "") | {"variant": BOUND_NAME, "RMSE, m": "0.0500"}
     blind = {"frames": "5", "packets": "1", "sigma, m": "0.2000", "x real time": "1.00"}
     assert rows_of(table(BLIND, bound=None)) == [{"variant": "v0"} | blind]
-    hidden = measured(visible=200, erased=1, hidden=50, claimed=20)
-    rows = rows_of(table(hidden, measured(), bound=None))
+    hidden = make_measured(visible=200, erased=1, hidden=50, claimed=20)
+    rows = rows_of(table(hidden, make_measured(), bound=None))
     assert [(row["erased"], row["claimed"]) for row in rows] == [("0.5%", "40.0%"), ("-", "-")]
 
 
 def test_total_adds_recordings() -> None:
-    one = table(measured(), measured(bit_errors=1))
+    one = table(make_measured(), make_measured(bit_errors=1))
     total = total_of([one, one])
     assert total.rows["v1"].tally.bit_errors == 2
-    assert total.rows["v0"].tally.rmse_m == measured().tally.rmse_m
+    assert total.rows["v0"].tally.rmse_m == make_measured().tally.rmse_m
     assert total.bounds_m == (0.05, 0.05)
     # A recording without truth adds frames and time, and takes nothing from the rest.
     mixed = total_of([one, table(BLIND, BLIND)])
-    assert mixed.rows["v0"].tally.ber == measured().tally.ber
+    assert mixed.rows["v0"].tally.ber == make_measured().tally.ber
     assert mixed.rows["v0"].statistics.rows == 95
 
 
 def test_json_csv_and_html_parse_back() -> None:
-    whole = comparison(table(measured(), measured(bit_errors=0)), table(BLIND, BLIND, bound=None))
+    whole = comparison(table(make_measured(), make_measured(bit_errors=0)), table(BLIND, BLIND, bound=None))
     parsed = json.loads(whole.to_json())
     assert parsed == json.loads(json.dumps(whole.to_dict(), allow_nan=False))
     first, second, third, _ = parsed["rows"]
-    assert first["rmse_m"] == measured().tally.rmse_m
+    assert first["rmse_m"] == make_measured().tally.rmse_m
     assert (first["cramer_rao_bound_m"], third["cramer_rao_bound_m"]) == (pytest.approx(0.05), None)
     assert "ber" in second["best"]
     assert (third["ber"], third["frames_sent"], third["bit_errors"]) == (None, None, None)
@@ -150,7 +150,7 @@ def test_json_csv_and_html_parse_back() -> None:
                 assert line[key] == "", key
     # A name that is a formula is none to a spreadsheet.
     formula = '=HYPERLINK("http://192.0.2.1/","a.raw")'
-    (row,) = csv.DictReader(io.StringIO(comparison(replace(table(measured()), name=formula)).to_csv()))
+    (row,) = csv.DictReader(io.StringIO(comparison(replace(table(make_measured()), name=formula)).to_csv()))
     assert f"'{formula}" in row.values()
     assert not any(text.startswith(("=", "@", "+")) for text in row.values())
     page = whole.to_html()

@@ -151,14 +151,14 @@ BARS: dict[str, tuple[list[str], int, int, float]] = {
 
 @pytest.mark.parametrize(("settings", "least", "lost", "rmse_m"), BARS.values(), ids=BARS)
 def test_any_layout_is_received_and_measured(settings, least, lost, rmse_m) -> None:
-    found = received(load_scene("night", settings))
+    found = receive_scene(load_scene("night", settings))
     assert found.frames_found >= found.frames_sent - lost > least
     assert found.bit_errors == 0
     assert lost or found.erased == 0
     assert not found.ranged or found.rmse_m < rmse_m
 
 
-def received(scene: Scene) -> Tally:
+def receive_scene(scene: Scene) -> Tally:
     simulation = Simulation(scene, 1)
     truth = truth_of(simulation)
     receiver = Receiver(truth.bars[0].link)

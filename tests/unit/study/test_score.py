@@ -268,7 +268,7 @@ GATE = {
 }
 
 
-def seen(truth: Truth) -> list[Packet]:
+def exact_packets(truth: Truth) -> list[Packet]:
     """Packets whose frames show the clusters of a scene exactly, of the last bar first."""
     scene = resolve_scene(GATE)
     path, t_us = truth.camera_path, truth.t_us
@@ -294,7 +294,7 @@ def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
     world = {**GATE["world"], "attitude": attitude}
     simulation = Simulation(resolve_scene(GATE | {"world": world}))
     truth = truth_of(simulation)
-    packets = seen(truth)
+    packets = exact_packets(truth)
     # What an IMU says that is as unsure as the scene has it, and happens to be right.
     exact = resolve_scene(GATE | {"world": {**world, "heading_sigma_deg": 0.0}})
     log = attitude_log(exact, 0, simulation.path)

@@ -104,7 +104,7 @@ def test_what_still_runs_is_read_from_its_log(results: Path) -> None:
     assert read(results).done == 18
 
 
-def told(summary: Summary) -> Elements:
+def draw_page(summary: Summary) -> Elements:
     """Everything that is told of a summary; its page."""
     json.dumps(summary.to_dict(), allow_nan=False)
     show_tables(summary)
@@ -125,7 +125,7 @@ def assert_plain(found: Elements) -> Elements:
     return found
 
 
-def keep(path: Path, plan: str) -> None:
+def keep_plan(path: Path, plan: str) -> None:
     change(path, "UPDATE plan SET body = ?", (plan,))
 
 
@@ -141,15 +141,15 @@ def test_what_was_changed_is_taken_or_refused_in_one_line(results, plan, changed
     table = {"bar": {"rows": 96, "cluster_rows": 6, "columns": 1, "cluster_columns": 1}}
     plan["links"][0]["identity"] = table | {"digest": "d" * 64, "table": {"ranging": {}, **table}}
     plan["scenes"][0]["identity"] = {"motion": {"speed_mps": 8.0}}
-    keep(results, json.dumps(plan))
+    keep_plan(results, json.dumps(plan))
     task, text = change(results, "SELECT task, statistics FROM result")[0]
     refused = 0
     for mutant, what in mutants(plan if changed == "plan" else json.loads(text), 10, seed=3):
         if changed == "plan":
-            keep(results, json.dumps(mutant))
+            keep_plan(results, json.dumps(mutant))
         else:
             change(results, "UPDATE result SET statistics = ? WHERE task = ?", (json.dumps(mutant), task))
-        line = refusal(lambda: told(read(results)))
+        line = refusal(lambda: draw_page(read(results)))
         if line is not None:
             refused += 1
             assert line.startswith(f"{results}: "), what
@@ -167,7 +167,7 @@ def test_what_was_changed_is_taken_or_refused_in_one_line(results, plan, changed
     ids=lambda value: str(value)[:20],
 )
 def test_what_is_no_plan_is_named_in_one_line(results, plan, body, message) -> None:
-    keep(results, body if isinstance(body, str) else json.dumps(plan | body))
+    keep_plan(results, body if isinstance(body, str) else json.dumps(plan | body))
     line = refusal(lambda: read(results)) or ""
     assert "a.sqlite: damaged, or no results file of evlcp sweep" in line
     assert message in line
@@ -186,6 +186,6 @@ def test_hostile_names_are_shown_as_they_are(tmp_path: Path, capsys: pytest.Capt
     )
     with Store(tmp_path / "a.sqlite", create=True) as store:
         collect(plan, store, Inline(), run_fake)
-    found = told(read(tmp_path / "a.sqlite"))
+    found = draw_page(read(tmp_path / "a.sqlite"))
     assert found.text.count(HOSTILE) > 8
     assert HOSTILE in capsys.readouterr().out
