@@ -348,7 +348,7 @@ def live(
                 clock_zero=clock_zero,
                 sinks=sinks,
                 lines=lines,
-                placed=lambda placed: loop.placed(placed),
+                on_fix=lambda placed: loop.placed(placed),
             ) as writer:
                 receiver = Receiver(
                     links,

@@ -60,7 +60,7 @@ class Serializer:
         """
         if self._shot[0] != picture.number:
             latest = [one for one in self._bars.values() if one.t_us > picture.t_us - _LATEST_US]
-            self._shot = picture.number, _picture_json(picture, latest), picture.image().png()
+            self._shot = picture.number, _picture_json(picture, latest), picture.image().to_png()
         return self._shot[1:]
 
     def _keep(self, frame: Frame) -> None:

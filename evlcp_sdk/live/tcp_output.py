@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from evlcp_sdk.live.publisher import News, Publisher
 from evlcp_sdk.live.server import Server
-from evlcp_sdk.results.gpsd import VERSION, answer, sky, tpv
-from evlcp_sdk.results.nmea import sentences
+from evlcp_sdk.results.gpsd import VERSION, answer_request, sky, tpv
+from evlcp_sdk.results.nmea import format_sentences
 from evlcp_sdk.utc import ClockZero, clock_zero_at
 
 _HOST: Final = "127.0.0.1"
@@ -82,7 +82,7 @@ class TcpOutput(Server):
         zero = clock_zero_at(self._zero, fix.t_us)
         text = b""
         if any(watch["nmea"] for watch in self._clients.values()):
-            text = sentences(fix, place, zero).encode("ascii", "replace")
+            text = format_sentences(fix, place, zero).encode("ascii", "replace")
         told = b""
         if self._gpsd:
             self._newest = {"TPV": tpv(fix, place, zero), "SKY": sky(fix, zero)}
@@ -113,7 +113,7 @@ class TcpOutput(Server):
                 if self._gpsd:
                     for request in line.decode("utf-8", "replace").split(";"):
                         if request.strip():
-                            for said in answer(request, watch, self._newest):
+                            for said in answer_request(request, watch, self._newest):
                                 self._put(writer, _line(said))
         except (OSError, ValueError, asyncio.CancelledError):
             pass  # It has gone, sends no lines, or the run is over.

@@ -47,7 +47,7 @@ def warm_up(links: Sequence[Link], *, positions: bool = False) -> None:
                 pictures.ask()
                 pictures.add(shown, camera.width, camera.height, receiver.regions)
                 if pictures.newest is not None:
-                    pictures.newest.image().png()
+                    pictures.newest.image().to_png()
                 receiver.feed(shown)
                 if int(events.t_us[0]) > first_us + _WARM_US:
                     break

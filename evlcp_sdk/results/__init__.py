@@ -1,4 +1,4 @@
-"""What a run leaves behind: one sink a format."""
+"""The results of a run: one sink a format."""
 
 from collections.abc import Iterator
 
@@ -36,10 +36,10 @@ _PAGES = (
         "the recording on one page: slow motion, charts, map, messages, warnings",
     ),
 )
-"""Of each format its name, where its sink is in `evlcp_sdk`, its files, and a line for help."""
+"""Of each format its name, its sink in `evlcp_sdk`, its files, and a line for help."""
 
 _DEFAULT = ("frames", "packets", "fixes", "track", "geojson", "nmea")
-"""Those that are written without being asked for."""
+"""Those that are written by default."""
 
 
 @hookimpl

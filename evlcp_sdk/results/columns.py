@@ -1,4 +1,4 @@
-"""What a frame, and a place, has to say by column: one list for CSV, Parquet and tables."""
+"""The columns of a frame and of a place: one list for CSV, Parquet and tables."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FILTERED_COLUMNS = ("distance_filtered_m", "distance_filtered_sigma_m")
 """Columns that follow where a tracking algorithm filters the distance."""
 
 LINK_COLUMN = "link"
-"""The last column where there are several links: the name of the one."""
+"""The last column where there are several links: the name of the frame's."""
 
 PLACE_COLUMNS = (
     *("latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m", "sigma_up_m"),
@@ -75,7 +75,7 @@ def frame_value(frame: Frame, column: str) -> Any:
 
 
 def place_row(place: Alternative | Fix | Place) -> list[str]:
-    """A place as text, by `PLACE_COLUMNS`; empty for what is not known."""
+    """A place as text, by `PLACE_COLUMNS`; empty where unknown."""
     return [
         *(format_or_empty(value, 10) for value in (place.latitude_deg, place.longitude_deg)),
         *(format_or_empty(value, 4) for value in (place.height_m, *sigmas(place.covariance_m2))),
@@ -91,7 +91,7 @@ def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "
     distance are there if any frame has one.
 
     Args:
-        packets: What a receiver gives; read to the end.
+        packets: Packets of a receiver; read to the end.
         kind: "pandas" for a `pandas.DataFrame`, "arrow" for a `pyarrow.Table`.
 
     Raises:

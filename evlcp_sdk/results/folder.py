@@ -12,17 +12,16 @@ from evlcp_sdk.plugin.records import SUMMARY
 
 
 class ResultFolder:
-    """Files in a hidden place of their own, which `finish` moves into the folder; a context manager.
+    """Files in a hidden folder that `finish` moves into the result's; a context manager.
 
     Until then, and after a crash, an earlier result stays as it was.
 
     Args:
-        folder: Made if need be.
-        files: Names of all files that a run may leave; those that this one does not write are dropped in
-            the end.
+        folder: Created if need be.
+        files: Names of all files that a run may leave; `finish` removes those that this one does not write.
 
     Raises:
-        OutputError: The folder cannot be written, or something in it that is no regular file has such a name.
+        OutputError: The folder cannot be written, or one of these names is no regular file.
     """
 
     def __init__(self, folder: Path, files: Iterable[str]) -> None:
@@ -31,35 +30,35 @@ class ResultFolder:
         self._used: set[str] = set()
         self._opened: set[str] = set()
         self._outputs = Outputs()
-        self._made = not folder.exists()
+        self._created = not folder.exists()
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
         for name in self._files:
             check_output(folder / name)
 
     def path(self, name: str) -> Path:
-        """Where a file is to be written until the run ends; nothing is there yet.
+        """Where to write a file until the run ends; nothing is there yet.
 
         Raises:
             ValueError: It is not among the files that a run may leave.
             OutputError: It cannot be written.
         """
-        return self._outputs.path(self._place(name))
+        return self._outputs.path(self._claim(name))
 
     def open(self, name: str) -> TextIO:
-        """A text file, UTF-8, line ends as written; it is closed with the folder.
+        """Open a text file, UTF-8, line ends as written; it is closed with the folder.
 
         Raises:
             ValueError: It is not among the files that a run may leave, or was opened before.
             OutputError: It cannot be written.
         """
-        return self._outputs.open(self._place(name, opened=True))
+        return self._outputs.open(self._claim(name, opened=True))
 
     def open_binary(self, name: str) -> BinaryIO:
-        """A binary file; else like `open`."""
-        return self._outputs.open_binary(self._place(name, opened=True))
+        """Open a binary file; else like `open`."""
+        return self._outputs.open_binary(self._claim(name, opened=True))
 
-    def _place(self, name: str, *, opened: bool = False) -> Path:
+    def _claim(self, name: str, *, opened: bool = False) -> Path:
         if name not in self._files:
             raise ValueError(f"'{name}' is not among the files of its record")
         if opened and name in self._opened:
@@ -69,7 +68,7 @@ class ResultFolder:
         return self.folder / name
 
     def digests(self) -> dict[str, dict[str, Any]]:
-        """Size in bytes and SHA-256 of each file, by name; they are closed.
+        """Close the files; size in bytes and SHA-256 of each, by name.
 
         Raises:
             OutputError: A file cannot be written, e.g. the disk is full.
@@ -78,7 +77,7 @@ class ResultFolder:
             return self._outputs.digests()
 
     def finish(self) -> None:
-        """Move all files into place, the one that was asked for last behind the others, and drop old ones.
+        """Move all files into place, the last one that was opened last, and remove old ones.
 
         Raises:
             OutputError: A file cannot be written, e.g. the disk is full.
@@ -94,18 +93,18 @@ class ResultFolder:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Drop what `finish` has not moved into place, and the folder, if it was made for nothing."""
+        """Drop what `finish` has not moved into place, and the folder if it was created and is empty."""
         self._outputs.discard()
-        if self._made:
-            with suppress(OSError):  # It holds a result.
+        if self._created:
+            with suppress(OSError):  # It has a result.
                 self.folder.rmdir()
 
 
 def read_summary(folder: Path | str) -> dict[str, Any] | None:
-    """What a result's `summary.json` says; None where there is none.
+    """Read a result's `summary.json`; None where there is none.
 
     Raises:
-        InputError: It cannot be read, is no object, or says that the files are unfinished.
+        InputError: It cannot be read, is no object, or marks the files as unfinished.
     """
     path = Path(folder) / SUMMARY
     if not path.exists():
@@ -117,15 +116,10 @@ def read_summary(folder: Path | str) -> dict[str, Any] | None:
 
 
 def check_result_file(folder: Path | str, name: str, summary: Mapping[str, Any]) -> None:
-    """See that a file of a result is the one that its summary speaks of.
-
-    Args:
-        folder: The result.
-        name: Name of the file.
-        summary: What `read_summary` found.
+    """Check that the file of this name in a result is the one that its summary lists.
 
     Raises:
-        InputError: The summary does not name it, or it is another file.
+        InputError: The summary does not list it, or it is another file.
     """
     path = Path(folder) / SUMMARY
     files = summary.get("files")

@@ -22,15 +22,15 @@ class FramesCsv(Sink):
     def packet(self, packet: Packet) -> None:
         """Write a row per frame."""
         for frame in packet.frames:
-            self._rows.writerow([_text(name, frame_value(frame, name)) for name in self._columns])
+            self._rows.writerow([_format_value(name, frame_value(frame, name)) for name in self._columns])
 
 
 _DIGITS = {"t_us": 2, "quality": 4, "x_px": 3, "y_px": 3}
-"""Digits behind the point; of distances and their sigmas, m, four."""
+"""Decimals; distances and their sigmas, m, have four."""
 
 
-def _text(column: str, value: Any) -> str:
-    """A value as text; empty where there is none, `-` for a symbol not given."""
+def _format_value(column: str, value: Any) -> str:
+    """A value as text; empty where there is none, `-` for a symbol that is not given."""
     if isinstance(value, float):
         return format_or_empty(value, _DIGITS.get(column, 4))
     if isinstance(value, list):

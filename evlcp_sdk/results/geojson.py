@@ -23,13 +23,13 @@ class GeoJson(Sink):
         self._trail = Trail()
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
-        """Write a fix that is given as a point; one that is refused with an alarm has no place."""
+        """Write a given fix as a point, and one refused with an alarm without a place."""
         if filtered is None:
             if fix.alarms:
-                why = {"t_us": round(fix.t_us, 1), "bars": list(fix.transmitters), "detail": fix.detail}
-                self._feature(None, [], why | integrity_fields(fix))
+                refusal = {"t_us": round(fix.t_us, 1), "bars": list(fix.transmitters), "detail": fix.detail}
+                self._write_feature(None, [], refusal | integrity_fields(fix))
             return
-        self._feature(
+        self._write_feature(
             "Point",
             [round(fix.longitude_deg, 9), round(fix.latitude_deg, 9), round(fix.height_m, 4)],
             {
@@ -46,13 +46,13 @@ class GeoJson(Sink):
     def settle(self, settled: Sequence[Settled]) -> None:
         """Write the smoothed places as a line, one per trajectory."""
         for line in self._trail.lines(settled):
-            self._feature("LineString", line, {"track": "smoothed"})
+            self._write_feature("LineString", line, {"track": "smoothed"})
 
     def finish(self) -> Mapping[str, Any]:
         """Write the bars, and end the file."""
         assert self.run.navigator is not None
         for number, site in self.run.navigator.positioner.bars.stands_at.items():
-            self._feature(
+            self._write_feature(
                 "Point",
                 [site.longitude_deg, site.latitude_deg, site.height_m],
                 {"bar": number, "transmitter_id": site.transmitter_id},
@@ -60,8 +60,8 @@ class GeoJson(Sink):
         self._file.write("]}\n")
         return {}
 
-    def _feature(self, kind: str | None, coordinates: list[Any], properties: dict[str, Any]) -> None:
-        shape = None if kind is None else {"type": kind, "coordinates": coordinates}
-        feature = {"type": "Feature", "geometry": shape, "properties": properties}
+    def _write_feature(self, kind: str | None, coordinates: list[Any], properties: dict[str, Any]) -> None:
+        geometry = None if kind is None else {"type": kind, "coordinates": coordinates}
+        feature = {"type": "Feature", "geometry": geometry, "properties": properties}
         self._file.write(("," if self._features else "") + "\n" + json.dumps(feature))
         self._features += 1

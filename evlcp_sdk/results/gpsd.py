@@ -1,4 +1,4 @@
-"""What gpsd says of a position, as its JSON (protocol 3): TPV and SKY, and answers to clients."""
+"""Positions as gpsd's JSON (protocol 3): TPV and SKY reports, and answers to clients."""
 
 import json
 import math
@@ -14,7 +14,7 @@ DEVICE: Final = "evlcp"
 """Name of the only device."""
 
 VERSION: Final = {"class": "VERSION", "release": "3.22", "rev": "evlcp", "proto_major": 3, "proto_minor": 14}
-"""What a client is sent first: the release whose protocol this is."""
+"""The first message to a client: the release whose protocol this is."""
 
 
 def tpv(fix: Fix, filtered: Place | None, zero: datetime | None) -> dict[str, Any]:
@@ -25,7 +25,7 @@ def tpv(fix: Fix, filtered: Place | None, zero: datetime | None) -> dict[str, An
     Args:
         fix: The fix, given or refused.
         filtered: The filtered place at its time; None for a refused one.
-        zero: UTC of the camera clock's 0; None: the report has no time.
+        zero: UTC of the camera clock's 0; None for a report without a time.
     """
     report: dict[str, Any] = {"class": "TPV", "device": DEVICE, "mode": 1 if filtered is None else 3}
     if zero is not None:
@@ -52,7 +52,7 @@ def tpv(fix: Fix, filtered: Place | None, zero: datetime | None) -> dict[str, An
 
 
 def sky(fix: Fix, zero: datetime | None) -> dict[str, Any]:
-    """The bars of a fix as a SKY report: those that count, in the place of satellites."""
+    """The bars of a fix as a SKY report, in the place of satellites."""
     used = not fix.refusal
     bars = [{"PRN": number, "used": used} for number in fix.transmitters]
     report: dict[str, Any] = {"class": "SKY", "device": DEVICE, "nSat": len(bars), "uSat": len(bars) * used}
@@ -61,12 +61,14 @@ def sky(fix: Fix, zero: datetime | None) -> dict[str, Any]:
     return report | {"satellites": bars}
 
 
-def answer(request: str, watch: dict[str, Any], newest: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """What gpsd answers to a line of a client.
+def answer_request(
+    request: str, watch: dict[str, Any], newest: dict[str, dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """The answer of gpsd to a line of a client.
 
     Args:
         request: The line, with or without its semicolon.
-        watch: What the client listens to; a `?WATCH` changes it.
+        watch: What the client subscribes to; a `?WATCH` changes it.
         newest: The newest reports, by class, for `?POLL`.
     """
     verb, _, text = request.strip().rstrip(";").partition("=")
@@ -83,15 +85,15 @@ def answer(request: str, watch: dict[str, Any], newest: dict[str, dict[str, Any]
     if verb != "?WATCH":
         return [{"class": "ERROR", "message": f"Unrecognized request '{request.strip()[:60]}'"}]
     try:
-        asked = json.loads(text) if text else {}
+        options = json.loads(text) if text else {}
     except ValueError:
-        asked = None
-    if not isinstance(asked, dict):
+        options = None
+    if not isinstance(options, dict):
         return [{"class": "ERROR", "message": "Invalid WATCH: expected an object"}]
     if text:
-        watch["enable"] = bool(asked.get("enable", True))
-        watch |= {name: bool(asked[name]) for name in ("json", "nmea") if name in asked}
-        if asked.get("raw"):
+        watch["enable"] = bool(options.get("enable", True))
+        watch |= {name: bool(options[name]) for name in ("json", "nmea") if name in options}
+        if options.get("raw"):
             watch["nmea"] = True
         if watch["enable"] and not watch["nmea"]:
             watch["json"] = True

@@ -1,4 +1,4 @@
-"""What is found, as a stream of lines of JSON: frames, messages, fixes."""
+"""Frames, messages and fixes as a stream of JSON lines."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -11,42 +11,42 @@ from evlcp_sdk.values import Fix, Frame, Packet
 
 
 class JsonLines:
-    """Gives a line for each frame, message and fix as it comes; `line` in it says which it is.
+    """Writes a line for each frame, message and fix as it comes; its key `line` is the kind.
 
     Args:
-        give: Takes a line, without its end.
-        filtered: Whether distances are filtered, too.
+        write: Takes a line, without its end.
+        filtered: Distances are filtered, too.
         links: There are several links.
-        links_of: Gives the names of those that a fix is computed from, where there are several.
+        links_of: Gives the names of the links that a fix is computed from, where there are several.
     """
 
     def __init__(
         self,
-        give: Callable[[str], None],
+        write: Callable[[str], None],
         *,
         filtered: bool = False,
         links: bool = False,
         links_of: Callable[[Fix], str] | None = None,
     ) -> None:
-        self._give = give
+        self._write = write
         self._links_of = links_of
         self._columns = frame_columns(filtered=filtered, links=links)
 
     def packet(self, packet: Packet) -> None:
-        """Give the lines of a packet: its frames, and then the messages that it completes.
+        """Write the lines of a packet: its frames, and then the messages that it completes.
 
         Raises:
             PluginError: A kind of messages fails.
         """
         for frame in packet.frames:
-            self._give(format_frame(frame, self._columns))
+            self._write(format_frame(frame, self._columns))
         for message in packet.messages:
-            self._give(json.dumps({"line": "message"} | json.loads(message_line(message))))
+            self._write(json.dumps({"line": "message"} | json.loads(message_line(message))))
 
     def fix(self, fix: Fix) -> None:
-        """Give the line of a fix, given or refused."""
+        """Write the line of a fix, given or refused."""
         links = {"link": self._links_of(fix)} if self._links_of is not None else {}
-        self._give(json.dumps(fix_line(fix) | links))
+        self._write(json.dumps(fix_line(fix) | links))
 
 
 def format_frame(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> str:
@@ -54,15 +54,15 @@ def format_frame(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> str:
 
     Args:
         frame: The frame.
-        columns: `FRAME_COLUMNS`, and others behind them.
+        columns: `FRAME_COLUMNS`, and others after them.
     """
-    soft, found = frame.soft, frame.range
-    # Written out, as there are hundreds a second: rounding and `json` take twice as long.
+    soft, distance = frame.soft, frame.range
+    # Written out for hundreds of frames a second: rounding and `json` take twice as long.
     numbers = (
         f'{{"line": "frame", "transmitter": {frame.transmitter}, "packet": {frame.packet},'
         f' "frame": {frame.frame}, "t_us": {frame.t_us:.2f}, "symbols": {list_symbols(soft.symbols)},'
-        f' "quality": {soft.quality:.4f}, "distance_m": {found.distance_m:.4f},'
-        f' "distance_sigma_m": {found.sigma_m:.4f}, "x_px": {frame.x_px:.3f}, "y_px": {frame.y_px:.3f},'
+        f' "quality": {soft.quality:.4f}, "distance_m": {distance.distance_m:.4f},'
+        f' "distance_sigma_m": {distance.sigma_m:.4f}, "x_px": {frame.x_px:.3f}, "y_px": {frame.y_px:.3f},'
         f' "echo_of": {frame.echo_of}'
     )
     text = (
@@ -75,7 +75,7 @@ def format_frame(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> str:
 
 
 def fix_line(fix: Fix) -> dict[str, Any]:
-    """What the line of a fix says, as JSON values."""
+    """The line of a fix, as JSON values."""
     return {
         "line": "fix",
         "t_us": round(fix.t_us, 1),

@@ -28,16 +28,16 @@ class PacketsJsonl(Sink):
 def packet_line(packet: Packet, link: Link) -> dict[str, Any]:
     """A packet's line, as JSON values; null and `?` for what was not received.
 
-    Where the framing's symbols are characters, `text` is what they say.
+    Where the framing's symbols are characters, `text` has them.
     """
     codebook = link.codebook
     symbols: list[list[int | None] | None] = [None] * packet.sent
-    each = codebook.bits_per_symbol
-    unknown, ones = "?" * each, (1 << each) - 1
+    width = codebook.bits_per_symbol
+    unknown, mask = "?" * width, (1 << width) - 1
     bits = [unknown * codebook.clusters] * packet.sent
     for frame in packet.frames:
         decoded = symbols[frame.frame] = list_symbols(frame.soft.symbols)
-        bits[frame.frame] = "".join([unknown if s is None else f"{s & ones:0{each}b}" for s in decoded])
+        bits[frame.frame] = "".join([unknown if s is None else f"{s & mask:0{width}b}" for s in decoded])
     return {
         "kind": "packet",
         "transmitter": packet.transmitter,
@@ -59,10 +59,10 @@ def packet_line(packet: Packet, link: Link) -> dict[str, Any]:
 
 
 def message_line(received: ReceivedMessage) -> str:
-    """A message's line: what every message has, and then what its kind shows.
+    """A message's line: the keys of every message, and then those of its kind.
 
     Raises:
-        PluginError: The kind fails, or shows a key that every message has.
+        PluginError: The kind fails, or gives a key that every message has.
     """
     message, kind = received.message, received.kind
     line: dict[str, Any] = {
@@ -78,12 +78,12 @@ def message_line(received: ReceivedMessage) -> str:
         "reason": received.reason,
         "age_s": None if received.age_s is None else round(received.age_s, 6),
     }
-    who = f"message kind '{kind.name}'"
+    subject = f"message kind '{kind.name}'"
     try:
-        shown = dict(kind.to_dict(received.value))
-        text = json.dumps(line | shown, ensure_ascii=False)
+        content = dict(kind.to_dict(received.value))
+        text = json.dumps(line | content, ensure_ascii=False)
     except (Exception, SystemExit) as fault:
-        raise PluginError(f"{who}: to_dict() fails: {type(fault).__name__}: {fault}") from fault
-    if twice := line.keys() & shown.keys():
-        raise PluginError(f"{who}: to_dict() shows '{min(twice)}', which every message has")
+        raise PluginError(f"{subject}: to_dict() fails: {type(fault).__name__}: {fault}") from fault
+    if duplicates := line.keys() & content.keys():
+        raise PluginError(f"{subject}: to_dict() shows '{min(duplicates)}', which every message has")
     return text

@@ -8,18 +8,18 @@ import numpy as np
 from evlcp_sdk.values import Events
 
 _PALETTE: Final = bytes([16, 16, 20, 70, 150, 255, 255, 205, 70, 235, 235, 235])
-"""Nothing, OFF, ON, both: the colours of the film and the report."""
+"""Colours of no event, OFF, ON and both, as in the film and the report."""
 
 
 class EventImage:
-    """Which polarities each pixel of a sensor showed, as PNG of two bits a pixel.
+    """Which polarities the pixels of a sensor showed, as a PNG picture of two bits a pixel.
 
     Args:
-        width: Of the sensor, px.
-        height: The same.
+        width: Width of the sensor, px.
+        height: Its height, px.
 
     Attributes:
-        cells: What each pixel showed, uint8 (height, width): 0 nothing, 1 OFF, 2 ON, 3 both.
+        cells: Polarities of each pixel, uint8 (height, width): 0 none, 1 OFF, 2 ON, 3 both.
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -27,18 +27,18 @@ class EventImage:
         self.cells = np.zeros((height, width), np.uint8)
 
     def paint(self, events: Events) -> None:
-        """Mark pixels that have events; those outside of the sensor are left out."""
+        """Mark the pixels that have events; those outside the sensor are left out."""
         inside = (events.x < self.width) & (events.y < self.height)
         if not inside.all():
             events = events[inside]
         np.bitwise_or.at(self.cells, (events.y, events.x), events.p + np.uint8(1))
 
     def clear(self) -> None:
-        """Begin again."""
+        """Remove all marks."""
         self.cells[:] = 0
 
-    def png(self) -> bytes:
-        """The picture as a PNG file; made quickly rather than small."""
+    def to_png(self) -> bytes:
+        """The picture as a PNG file, quick to make rather than small."""
         from PIL import Image
 
         picture = Image.frombuffer("P", (self.width, self.height), self.cells, "raw", "P", 0, 1)

@@ -18,7 +18,7 @@ _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 class _Table(Sink):
-    """A CSV file of some columns; where there are several links, the last one names the row's."""
+    """A CSV file with these columns, and one for the link's name where there are several links."""
 
     name: ClassVar[str]
     columns: ClassVar[tuple[str, ...]]
@@ -65,7 +65,7 @@ class FixesCsv(_Table):
 
 
 class AlternativesCsv(_Table):
-    """Writes `alternatives.csv`: a row per pose that fits where a fix is refused, as more than one does."""
+    """Writes `alternatives.csv`: a row per pose that fits where a fix is refused because several do."""
 
     name = "alternatives.csv"
     columns = (
@@ -74,19 +74,19 @@ class AlternativesCsv(_Table):
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a row per pose, the likeliest first."""
-        for number, one in enumerate(fix.alternatives):
+        for number, pose in enumerate(fix.alternatives):
             self._rows.writerow(
                 [
-                    *(f"{fix.t_us:.1f}", number, f"{one.likelihood:.6g}"),
-                    *place_row(one),
-                    *(f"{angle:.4f}" for angle in (one.heading_deg, one.pitch_deg, one.roll_deg)),
+                    *(f"{fix.t_us:.1f}", number, f"{pose.likelihood:.6g}"),
+                    *place_row(pose),
+                    *(f"{angle:.4f}" for angle in (pose.heading_deg, pose.pitch_deg, pose.roll_deg)),
                     " ".join(map(str, fix.transmitters)),
                 ]
             )
 
 
 class TrackCsv(_Table):
-    """Writes `track.csv`: a row per fix that is given, its place smoothed and filtered."""
+    """Writes `track.csv`: a row per given fix, its place smoothed and filtered."""
 
     name = "track.csv"
     columns = (
@@ -96,15 +96,15 @@ class TrackCsv(_Table):
 
     def settle(self, settled: Sequence[Settled]) -> None:
         """Write a row per fix."""
-        for one in settled:
-            smoothed = one.smoothed
+        for row in settled:
+            smoothed = row.smoothed
             self._rows.writerow(
                 [
-                    f"{one.fix.t_us:.1f}",
+                    f"{row.fix.t_us:.1f}",
                     *place_row(smoothed),
                     *(f"{smoothed.speed_m_s:.3f}", f"{smoothed.course_deg:.2f}"),
-                    *place_row(one.filtered),
-                    *(int(one.filtered.left_out), one.fix.source),
+                    *place_row(row.filtered),
+                    *(int(row.filtered.left_out), row.fix.source),
                     *(format_or_empty(v, 6) for v in (smoothed.focal_share, smoothed.focal_share_sigma)),
                 ]
             )
@@ -121,19 +121,19 @@ class PointsCsv(_Table):
     names_link = True
 
     def packet(self, packet: Packet) -> None:
-        """Write a row per frame that has a distance; reflections are no bars at a place."""
+        """Write a row per frame that has a distance and is no reflection."""
         link = self.run.link_of(packet.link)
         errors = ErrorModel.of(link.position)
         for frame in packet.frames:
-            found = None
+            point = None
             if frame.echo_of is None:
-                found = bar_point(frame, link.bar.length_m, link.camera, link.camera_sigma, errors)
-            if found is not None:
+                point = bar_point(frame, link.bar.length_m, link.camera, link.camera_sigma, errors)
+            if point is not None:
                 self._rows.writerow(
                     [
                         *(frame.transmitter, frame.packet, frame.frame, f"{frame.t_us:.2f}"),
-                        *(f"{value:.4f}" for value in found.point_m),
-                        *(f"{found.covariance_m2[i, j]:.6g}" for i, j in _PAIRS),
+                        *(f"{value:.4f}" for value in point.point_m),
+                        *(f"{point.covariance_m2[i, j]:.6g}" for i, j in _PAIRS),
                         *([packet.link] if packet.link else []),
                     ]
                 )

@@ -1,4 +1,4 @@
-"""What every output format is to a run: a sink that takes packets and positions as they come."""
+"""The interface of every output format: a sink, which takes packets and positions as they come."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a sink may know of the run whose results it writes.
+    """The run whose results a sink writes.
 
     Attributes:
         name: Name of the recording, for titles.
-        link: The configuration that the receiver runs with.
+        link: The receiver's configuration; the first of several.
         plan: What positions are computed from; None where none are computed.
-        navigator: Computes them; at the end it says where the bars stand. None where none are computed.
-        clock_zero: UTC of the camera clock's 0, or pulses that say it: `utc.zero_at` of a time. None where it
-            is not known.
-        links: Where there are several, all of them by name; `link` is the first one then.
+        navigator: Computes them, and knows at the end where the bars stand; None where none are computed.
+        clock_zero: UTC of the camera clock's 0, or pulses that give it, see `utc.clock_zero_at`. None where
+            it is not known.
+        links: Where there are several, all of them by name.
     """
 
     name: str
@@ -37,12 +37,12 @@ class Run:
     links: Mapping[str, Link] = field(default_factory=dict)
 
     def link_of(self, name: str) -> Link:
-        """The link of a frame, a packet or a message, by the name that it gives."""
+        """The link of a frame, packet or message, by its name."""
         return self.links.get(name, self.link)
 
     @property
     def filtered(self) -> bool:
-        """Whether a link filters distances, so that there are columns for them."""
+        """Whether any link filters distances, so that there are columns for them."""
         from evlcp_sdk.rx.guard import tracker_of
 
         links = self.links.values() or [self.link]
@@ -50,14 +50,14 @@ class Run:
 
 
 class Sink:
-    """One output format: a derived class takes what it needs, and writes it as it comes, in constant memory.
+    """One output format: a derived class takes what it needs and writes it as it comes, in constant memory.
 
-    A method that is not overridden does nothing. A sink that has a method of the hook `evlcp_stage_finished`,
-    marked with `@hookimpl`, watches the receiver's stages, too.
+    A method that is not overridden does nothing. A sink with a method `evlcp_stage_finished`, marked with
+    `@hookimpl`, observes the receiver's stages, too.
 
     Args:
-        folder: Where its files are opened; they are moved into place together when the run ends.
-        run: What is written down.
+        folder: Opens its files; they are moved into place together when the run ends.
+        run: The run whose results it writes.
     """
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
@@ -74,10 +74,10 @@ class Sink:
         """Take the next fix, given or refused, and the filtered place at its time; None for a refused one."""
 
     def settle(self, settled: Sequence[Settled]) -> None:
-        """Take the next fixes that are smoothed: all that are given, in order of time, many at a time."""
+        """Take the next smoothed fixes: all that are given, in order of time, many at a time."""
 
     def finish(self) -> Mapping[str, Any]:
-        """Write the rest; return what the summary shall say under `sinks`, as JSON values."""
+        """Write the rest; return this sink's part of the summary's `sinks`, as JSON values."""
         return {}
 
     def conclude(self, summary: Mapping[str, Any]) -> None:

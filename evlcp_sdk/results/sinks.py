@@ -1,4 +1,4 @@
-"""All sinks of one run as one, and whose fault it is when one of them fails."""
+"""All sinks of one run as one, with the name of the one that fails."""
 
 from __future__ import annotations
 
@@ -38,9 +38,10 @@ def load_sinks(chosen: Sequence[InstalledSink]) -> list[tuple[InstalledSink, typ
 
 
 class Sinks:
-    """Hands on what a run finds to each of its sinks.
+    """Passes the results of a run to each of its sinks.
 
-    What a sink raises becomes a `PluginError` that names it, or an `OutputError` where the disk refuses.
+    An exception of a sink becomes a `PluginError` that names it, or an `OutputError` where a file cannot be
+    written.
     """
 
     def __init__(self) -> None:
@@ -50,7 +51,7 @@ class Sinks:
     def open(
         self, classes: Sequence[tuple[InstalledSink, type[Sink]]], folder: ResultFolder, run: Run
     ) -> None:
-        """Make sinks of their classes, in the order in which they are called.
+        """Create sinks of these classes; they are called in this order.
 
         Raises:
             OutputError: A file cannot be opened.
@@ -62,47 +63,47 @@ class Sinks:
 
     @property
     def all(self) -> tuple[Sink, ...]:
-        """The sinks themselves."""
+        """The sinks."""
         return tuple(sink for _, sink in self._sinks)
 
     def events(self, events: Events) -> None:
-        """Hand on events."""
-        self._each(lambda sink: sink.events(events))
+        """Pass on events."""
+        self._call_all(lambda sink: sink.events(events))
 
     def packet(self, packet: Packet) -> None:
-        """Hand on a packet."""
-        self._each(lambda sink: sink.packet(packet))
+        """Pass on a packet."""
+        self._call_all(lambda sink: sink.packet(packet))
 
-    def placed(self, placed: Placed) -> None:
-        """Hand on a fix, and what it settles."""
-        self._each(lambda sink: sink.fix(placed.fix, placed.filtered))
+    def fix(self, placed: Placed) -> None:
+        """Pass on a fix, and those that are smoothed with it."""
+        self._call_all(lambda sink: sink.fix(placed.fix, placed.filtered))
         if placed.settled:
             self.settle(placed.settled)
 
     def settle(self, settled: Sequence[Settled]) -> None:
-        """Hand on fixes that are settled."""
-        self._each(lambda sink: sink.settle(settled))
+        """Pass on smoothed fixes."""
+        self._call_all(lambda sink: sink.settle(settled))
 
     def finish(self) -> dict[str, Mapping[str, Any]]:
-        """End the sinks; return what they say, by name."""
-        found: dict[str, Mapping[str, Any]] = {}
+        """Finish the sinks; return their parts of the summary, by name."""
+        parts: dict[str, Mapping[str, Any]] = {}
         for installed, sink in self._sinks:
             with self._blame(installed):
                 part: object = sink.finish()
                 if part is not None and not isinstance(part, Mapping):
                     raise PluginError(f"{installed}: finish() gave {type(part).__name__}, expected a mapping")
                 if part:
-                    # What JSON cannot say is the sink's fault, not the summary's.
+                    # A value that is not JSON is the sink's fault, not the summary's.
                     json.dumps(dict(part), allow_nan=False)
-                    found[installed.record.name] = dict(part)
-        return found
+                    parts[installed.record.name] = dict(part)
+        return parts
 
     def conclude(self, summary: Mapping[str, Any]) -> None:
-        """Hand on the summary, all but its `files`."""
-        # A copy: what a sink changes in it would be missing in summary.json.
-        self._each(lambda sink: sink.conclude(deepcopy(dict(summary))))
+        """Pass on the summary, all but its `files`."""
+        # A copy, so that a sink cannot change summary.json.
+        self._call_all(lambda sink: sink.conclude(deepcopy(dict(summary))))
 
-    def _each(self, call: Callable[[Sink], None]) -> None:
+    def _call_all(self, call: Callable[[Sink], None]) -> None:
         for installed, sink in self._sinks:
             with self._blame(installed):
                 call(sink)

@@ -1,4 +1,4 @@
-"""`summary.json`: what a run found, from what, how fast, and what was lost."""
+"""`summary.json`: what a run found, in which recording, how fast, and what was lost."""
 
 import json
 from collections.abc import Mapping
@@ -16,8 +16,8 @@ from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.results.folder import ResultFolder
 
 Status = Literal["complete", "degraded", "interrupted", "failed"]
-"""How a run ended: read to the end, the same with much of it dropped, stopped by the user, or stopped by
-input that cannot be read."""
+"""How a run ended: read to the end, likewise with much of it dropped, stopped by the user, or by input
+that cannot be read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,13 +26,13 @@ class RunEnd:
 
     Attributes:
         status: How it ended.
-        recording: What was read: path, format, size, duration, events.
+        recording: Path, format, size, duration and events of the recording.
         processing: How long it took.
         counts: The receiver's counts.
         losses: What the reader skipped, by kind, with byte offsets.
         error: The message, when `status` is `failed` or `degraded`.
-        lit_us: From when until when the light of each transmitter was there, us; None if it is not known.
-        live: Delays, and what was shed, of a live run; None for others.
+        lit_us: First and last time of each transmitter's light, us; None if it is not known.
+        live: Delays and dropped events of a live run; None for others.
         link_counts: The receiver's counts of each of several links, by name.
     """
 
@@ -47,7 +47,7 @@ class RunEnd:
     link_counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
 
 
-def summary_of(
+def build_summary(
     end: RunEnd,
     facts: Facts,
     versions: Mapping[str, str],
@@ -58,30 +58,31 @@ def summary_of(
 
     Args:
         end: How the run ended.
-        facts: What the receiver found, with the configuration that it ran with.
+        facts: The receiver's findings and configuration.
         versions: Installed versions.
-        sinks: What sinks say, by name; those that say nothing are left out.
-        pps: Pulses of UTC, and the rate of the camera's clock by them; None where nobody asked.
+        sinks: Parts of the sinks that have one, by name.
+        pps: Pulses of UTC, and the rate of the camera's clock by them; None where they are not used.
     """
-    tally, found = facts.tally, run_checks(facts)
+    tally, diagnostics = facts.tally, run_checks(facts)
     if facts.parts:
-        described = {"links": {name: _describe(one.link) | _found(one) for name, one in facts.parts.items()}}
+        parts = {name: _describe_link(one.link) | _link_results(one) for name, one in facts.parts.items()}
+        description: dict[str, Any] = {"links": parts}
     else:
-        described = _describe(facts.link)
+        description = _describe_link(facts.link)
     return {
         "status": end.status,
         "error": end.error,
         "result": tally.headline(),
-        "transmitters": [one | _text(one, facts) for one in tally.to_list()],
+        "transmitters": [one | _character_text(one, facts) for one in tally.to_list()],
         "recording": dict(end.recording),
         "processing": dict(end.processing),
         "counts": dict(facts.counts),
         "messages": tally.messages(),
-        "messages_off": None if facts.reads_messages else messages_off(facts.link),
-        "warnings": [one.to_dict() for one in found if one.verdict in ("doubt", "fail")],
-        "notes": [one.to_dict() for one in found if one.verdict == "note"],
+        "messages_off": None if facts.reads_messages else messages_off_reason(facts.link),
+        "warnings": [one.to_dict() for one in diagnostics if one.verdict in ("doubt", "fail")],
+        "notes": [one.to_dict() for one in diagnostics if one.verdict == "note"],
         "losses": {kind: asdict(loss) for kind, loss in end.losses.items()},
-        **described,
+        **description,
         "versions": dict(versions),
         **({"positions": dict(facts.positions)} if facts.positions else {}),
         **({"sinks": {name: dict(part) for name, part in sinks.items()}} if sinks else {}),
@@ -90,8 +91,8 @@ def summary_of(
     }
 
 
-def _text(figures: Mapping[str, Any], facts: Facts) -> dict[str, Any]:
-    """What a transmitter says in characters, if its framing sends such and it sends no blocks."""
+def _character_text(figures: Mapping[str, Any], facts: Facts) -> dict[str, Any]:
+    """A transmitter's text, if its framing sends characters and it sends no blocks."""
     part = facts.parts.get(figures.get("link", ""), facts)
     one = facts.tally.transmitters[figures["transmitter"]]
     if not part.link.characters_on_air or one.blocks:
@@ -99,8 +100,8 @@ def _text(figures: Mapping[str, Any], facts: Facts) -> dict[str, Any]:
     return {"text": decode_characters(one.firsts)}
 
 
-def _describe(link: Link) -> dict[str, Any]:
-    """What a link is, so that a result can be made again."""
+def _describe_link(link: Link) -> dict[str, Any]:
+    """A link, so that a result can be reproduced."""
     return {
         "digest": link.digest,
         "codebook": {"digest": link.codebook.digest, "profile": link.codebook.profile},
@@ -109,9 +110,9 @@ def _describe(link: Link) -> dict[str, Any]:
     }
 
 
-def _found(part: Facts) -> dict[str, Any]:
-    """What one of several links found, and whether its messages were read."""
-    return {"counts": dict(part.counts), "messages_off": messages_off(part.link)}
+def _link_results(part: Facts) -> dict[str, Any]:
+    """The counts of one of several links, and whether its messages were read."""
+    return {"counts": dict(part.counts), "messages_off": messages_off_reason(part.link)}
 
 
 def write_summary(table: Mapping[str, Any], folder: ResultFolder) -> None:
@@ -124,7 +125,7 @@ def write_summary(table: Mapping[str, Any], folder: ResultFolder) -> None:
         folder.open(SUMMARY).write(json.dumps(table, indent=2) + "\n")
 
 
-def messages_off(link: Link) -> str | None:
+def messages_off_reason(link: Link) -> str | None:
     """Why messages were not read; None where they were."""
     if not link.messages.decode:
         return "messages.decode = false"

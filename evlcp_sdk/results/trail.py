@@ -11,29 +11,29 @@ Line = list[list[float]]
 
 
 class Trail:
-    """Puts smoothed places together to lines as they come: one per trajectory, going on where it ended."""
+    """Joins smoothed places to lines as they come: one per trajectory, continued from call to call."""
 
     def __init__(self) -> None:
         self._end: Line = []
 
     def lines(self, settled: Sequence[Settled]) -> Iterator[Line]:
-        """The lines that some more places make, of two points or more, none across the 180th meridian."""
-        whole, line = [], self._end
-        for one in settled:
-            if one.filtered.starts and line:
-                whole.append(line)
+        """The lines of the next places, of two points or more, none across the 180th meridian."""
+        complete, line = [], self._end
+        for fix in settled:
+            if fix.filtered.starts and line:
+                complete.append(line)
                 line = []
-            place = one.smoothed
+            place = fix.smoothed
             line.append(
                 [round(place.longitude_deg, 9), round(place.latitude_deg, 9), round(place.height_m, 4)]
             )
         self._end = line[-1:]
-        for one_line in (*whole, line):
-            yield from (piece for piece in cut(one_line) if len(piece) > 1)
+        for path in (*complete, line):
+            yield from (piece for piece in split_at_antimeridian(path) if len(piece) > 1)
 
 
-def cut(line: list[list[float]]) -> list[list[list[float]]]:
-    """A line in pieces that do not cross the 180th meridian (RFC 7946, 3.1.9)."""
+def split_at_antimeridian(line: Line) -> list[Line]:
+    """Split a line into pieces that do not cross the 180th meridian (RFC 7946, 3.1.9)."""
     pieces = [line[:1]]
     for here, there in pairwise(line):
         turn = there[0] - here[0]

@@ -1,4 +1,4 @@
-"""One run's result: packets in; tallies, positions and files out."""
+"""The result of one run: packets in; tallies, positions and files out."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.lines import JsonLines
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.sinks import Sinks, load_sinks
-from evlcp_sdk.results.summary import RunEnd, messages_off, summary_of, write_summary
+from evlcp_sdk.results.summary import RunEnd, build_summary, messages_off_reason, write_summary
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Packet
@@ -34,19 +34,19 @@ if TYPE_CHECKING:
 class ResultWriter:
     """Writes one recording's result into a folder; use as a context manager, end with `finish`.
 
-    In the context, sinks that have hooks are called by the registry: make the receiver in it.
+    Create the receiver in the context, where the registry calls sinks that have hooks.
 
     Args:
-        folder: Made if need be; an earlier result in it is replaced by `finish`. None: nothing is written.
-        link: The configuration that the receiver runs with, or several.
+        folder: Created if need be; `finish` replaces an earlier result in it. None to write nothing.
+        link: The receiver's configuration, or several.
         registry: Where sinks are found; None for all that are installed.
         name: Name of the recording, for titles.
-        plan: What positions are computed from; None for none.
-        attitude: What is known of the camera's attitude, for positions; None for nothing.
-        clock_zero: UTC of the camera clock's 0, or pulses that say it; None if it is not known.
+        plan: What positions are computed from; None for no positions.
+        attitude: The camera's known attitude, for positions; None where it is not known.
+        clock_zero: UTC of the camera clock's 0, or pulses that give it; None if it is not known.
         sinks: Output formats beside the default ones, by name; none without a folder.
-        lines: Takes frames, messages and fixes as lines of JSON as they come; None for nobody.
-        placed: Takes fixes, with their filtered places, as they come; None for nobody.
+        lines: Takes frames, messages and fixes as lines of JSON as they come.
+        on_fix: Takes fixes, with their filtered places, as they come.
 
     Raises:
         OutputError: The folder cannot be written.
@@ -66,16 +66,16 @@ class ResultWriter:
         clock_zero: ClockZero = None,
         sinks: Sequence[str] = (),
         lines: Callable[[str], None] | None = None,
-        placed: Callable[[Placed], None] | None = None,
+        on_fix: Callable[[Placed], None] | None = None,
     ) -> None:
-        self._on_placed = placed
+        self._on_fix = on_fix
         self._registry = Registry.load() if registry is None else registry
         self._links = named_links(link)
         first = next(iter(self._links.values()))
         placing = placing_links(self._links) if plan is not None else {}
         self._navigator: Navigator | None = None
         if plan is not None:
-            # What computes positions takes a tenth of a start.
+            # Imported here: it takes a tenth of a start.
             from evlcp_sdk.place.navigator import Navigator
 
             plan.check_links(list(self._links))
@@ -105,7 +105,7 @@ class ResultWriter:
             self._stack = stack.pop_all()
 
     def events(self, events: Events) -> None:
-        """Take events that the receiver gets."""
+        """Take the receiver's next events."""
         self._readout.add(events)
         if self._navigator is not None and len(events):
             self._navigator.note_span(int(events.t_us[0]), int(events.t_us[-1]))
@@ -124,10 +124,10 @@ class ResultWriter:
             if self._lines is not None:
                 self._lines.packet(packet)
             if self._navigator is not None:
-                self._place(self._navigator.feed([packet]))
+                self._write_fixes(self._navigator.feed([packet]))
 
     def finish(self, end: RunEnd) -> dict[str, Any]:
-        """End the sinks, move all files into place, the summary last, and drop what an earlier run left.
+        """Finish the sinks, move all files into place, the summary last, and remove an earlier result.
 
         Returns:
             The content of `summary.json`.
@@ -139,11 +139,11 @@ class ResultWriter:
         positions: dict[str, Any] = {}
         if self._navigator is not None:
             fixes, settled = self._navigator.close()
-            self._place(fixes)
+            self._write_fixes(fixes)
             self._sinks.settle(settled)
             positions = self._positions.to_dict(self._navigator)
-        facts = self._facts(end, positions)
-        table = summary_of(
+        facts = self._collect_facts(end, positions)
+        table = build_summary(
             end,
             facts,
             self._registry.versions(),
@@ -158,8 +158,8 @@ class ResultWriter:
             self._folder.finish()
         return table
 
-    def _facts(self, end: RunEnd, positions: Mapping[str, Any]) -> Facts:
-        """What is known in the end, for warnings."""
+    def _collect_facts(self, end: RunEnd, positions: Mapping[str, Any]) -> Facts:
+        """What the checks go by at the end."""
         recording = end.recording
         first_us, last_us = recording.get("first_us"), recording.get("last_us")
         read = recording.get("counts", {})
@@ -184,7 +184,7 @@ class ResultWriter:
                 link=link,
                 tally=self._tally.of_link(name),
                 counts=end.link_counts.get(name, end.counts),
-                reads_messages=messages_off(link) is None,
+                reads_messages=messages_off_reason(link) is None,
                 others=partial(other_codewords, link, self._registry),
                 positions=positions if name == self._placing else {},
             )
@@ -195,14 +195,14 @@ class ResultWriter:
         reads = any(one.reads_messages for one in parts.values())
         return replace(facts, reads_messages=reads, parts=parts)
 
-    def _place(self, fixes: Iterable[Placed]) -> None:
+    def _write_fixes(self, fixes: Iterable[Placed]) -> None:
         for placed in fixes:
             self._positions.add(placed)
-            self._sinks.placed(placed)
+            self._sinks.fix(placed)
             if self._lines is not None:
                 self._lines.fix(placed.fix)
-            if self._on_placed is not None:
-                self._on_placed(placed)
+            if self._on_fix is not None:
+                self._on_fix(placed)
 
     def __enter__(self) -> Self:
         return self

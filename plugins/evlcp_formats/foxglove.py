@@ -143,7 +143,7 @@ class Mcap(Sink):
         if self._picture is None:
             return
         end_us = (self._picture + 1) * _PICTURE_US
-        image = _schema("CompressedImage")(frame_id=CAMERA_ID, data=self._image.png(), format="png")
+        image = _schema("CompressedImage")(frame_id=CAMERA_ID, data=self._image.to_png(), format="png")
         image.timestamp.FromNanoseconds(self._at_ns(end_us))
         self._write("/image", end_us, image)
         self._image.clear()

@@ -406,7 +406,7 @@ def nmea_of(path: dict[str, list[float]], at_ms: Sequence[int], file: Path) -> P
     """GGA and GST of a camera's path from noon on, 0.1 m precise."""
     lines = []
     for ms in at_ms:
-        clock = nmea.clock_of(ms * 1e3, datetime(2026, 3, 1, 12, tzinfo=UTC))
+        clock = nmea.format_clock(ms * 1e3, datetime(2026, 3, 1, 12, tzinfo=UTC))
         place = path["latitude_deg"][ms], path["longitude_deg"][ms], path["height_m"][ms]
         lines += [nmea.gga(clock, place, 9), nmea.gst(clock, 0.0, 0.01 * np.eye(3))]
     file.write_text("".join(lines))

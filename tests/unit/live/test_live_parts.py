@@ -72,7 +72,7 @@ def test_a_picture_is_read_back(size: tuple[int, int], density: float) -> None:
         image.paint(events)
         paint(cells, events)
     assert (image.cells == cells).all()
-    reported = image.png()
+    reported = image.to_png()
     with Image.open(io.BytesIO(reported)) as picture:
         picture.load()
         assert picture.mode == "P"

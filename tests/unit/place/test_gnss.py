@@ -14,7 +14,7 @@ from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.gnss import GnssLog, attitude_of, checksum, geoid_m, gnss_fix, read_nmea
 from evlcp_sdk.place.trajectory import GNSS, filter_fixes, smooth_trajectory, trajectory_step
-from evlcp_sdk.results.nmea import clock_of, gst
+from evlcp_sdk.results.nmea import format_clock, gst
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Fix
@@ -170,7 +170,7 @@ def test_a_place_with_its_sigmas(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(log.covariance_m2[0])), [0.020, 0.023, 0.031])
     # An ellipse is that of the covariance.
     covariance = np.array([[4.0, -1.5, 0.0], [-1.5, 1.0, 0.0], [0.0, 0.0, 9.0]])
-    reported = gst(clock_of(0.0, NOON), 1.0, covariance).strip()
+    reported = gst(format_clock(0.0, NOON), 1.0, covariance).strip()
     found = read_nmea(write(tmp_path, reported, at("120000.00")), NOON, 0.0)
     np.testing.assert_allclose(found.covariance_m2, [covariance], atol=0.01)
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 from evlcp_sdk.place.navigator import Place
-from evlcp_sdk.results.gpsd import answer, sky, tpv
-from evlcp_sdk.results.nmea import clock_of, gga, rmc
+from evlcp_sdk.results.gpsd import answer_request, sky, tpv
+from evlcp_sdk.results.nmea import format_clock, gga, rmc
 from evlcp_sdk.values import Fix
 
 ZERO = datetime(2026, 3, 1, 23, 59, 58, tzinfo=UTC)
@@ -21,7 +21,7 @@ ZERO = datetime(2026, 3, 1, 23, 59, 58, tzinfo=UTC)
 )  # fmt: skip
 def test_sentences_read_back(lat, lon, height, t_us, bars, speed, course) -> None:
     place = (lat, lon, height)
-    seen = pynmea2.parse(gga(clock_of(t_us, ZERO), place, bars).strip(), check=True)
+    seen = pynmea2.parse(gga(format_clock(t_us, ZERO), place, bars).strip(), check=True)
     assert seen.talker == "IN"
     # 1e-7 minutes, rounded.
     assert seen.latitude == pytest.approx(lat, abs=1e-9)
@@ -31,7 +31,7 @@ def test_sentences_read_back(lat, lon, height, t_us, bars, speed, course) -> Non
     assert (seen.altitude_units, seen.geo_sep_units) == ("M", "M")
     assert (seen.gps_qual, int(seen.num_sats)) == (6, bars)
     assert seen.horizontal_dil == ""
-    moved = pynmea2.parse(rmc(clock_of(t_us, ZERO), place, (speed, course)).strip(), check=True)
+    moved = pynmea2.parse(rmc(format_clock(t_us, ZERO), place, (speed, course)).strip(), check=True)
     assert moved.is_valid
     assert moved.latitude == pytest.approx(lat, abs=1e-9)
     assert moved.spd_over_grnd == pytest.approx(speed * 3600 / 1852, abs=6e-4)
@@ -42,7 +42,7 @@ def test_sentences_read_back(lat, lon, height, t_us, bars, speed, course) -> Non
 
 
 def test_no_fix_says_so() -> None:
-    begun = clock_of(1e6, None)
+    begun = format_clock(1e6, None)
     seen = pynmea2.parse(gga(begun, None, 0).strip(), check=True)
     assert seen.gps_qual == 0
     assert seen.lat == ""
@@ -56,8 +56,8 @@ def test_no_fix_says_so() -> None:
 
 
 def test_sixty_minutes_carry() -> None:
-    assert ",0.00,010326," in rmc(clock_of(0, ZERO), (0.0, 0.0, 0.0), (0.0, 359.999))
-    assert ",3600.0000000,N," in gga(clock_of(0, None), (35.9999999999, 0.0, 0.0), 1)
+    assert ",0.00,010326," in rmc(format_clock(0, ZERO), (0.0, 0.0, 0.0), (0.0, 359.999))
+    assert ",3600.0000000,N," in gga(format_clock(0, None), (35.9999999999, 0.0, 0.0), 1)
 
 
 def test_reports_say_what_the_fix_says() -> None:
@@ -78,12 +78,12 @@ def test_reports_say_what_the_fix_says() -> None:
 
 def test_clients_are_answered() -> None:
     watch = {"enable": False, "json": False, "nmea": False}
-    reported = answer('?WATCH={"enable":true,"json":true};', watch, {})
+    reported = answer_request('?WATCH={"enable":true,"json":true};', watch, {})
     assert [one["class"] for one in reported] == ["DEVICES", "WATCH"]
     assert watch == {"enable": True, "json": True, "nmea": False}
-    answer('?WATCH={"enable":true,"nmea":true}', watch, {})
+    answer_request('?WATCH={"enable":true,"nmea":true}', watch, {})
     assert watch["nmea"]
-    assert answer("?VERSION;", watch, {})[0]["proto_major"] == 3
-    assert answer("?POLL;", watch, {"TPV": {"mode": 3}})[0]["tpv"] == [{"mode": 3}]
+    assert answer_request("?VERSION;", watch, {})[0]["proto_major"] == 3
+    assert answer_request("?POLL;", watch, {"TPV": {"mode": 3}})[0]["tpv"] == [{"mode": 3}]
     for fault in ("?WATCH={", "?WATCH=[1]", "hello", "?\x00"):
-        assert answer(fault, watch, {})[0]["class"] == "ERROR"
+        assert answer_request(fault, watch, {})[0]["class"] == "ERROR"

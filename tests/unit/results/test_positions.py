@@ -34,7 +34,7 @@ from evlcp_sdk.results.nmea import Nmea
 from evlcp_sdk.results.position_tables import AlternativesCsv, FixesCsv, PointsCsv
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.summary import RunEnd
-from evlcp_sdk.results.trail import cut
+from evlcp_sdk.results.trail import split_at_antimeridian
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
@@ -289,14 +289,14 @@ def test_the_figure_of_a_track() -> None:
 
 
 def test_a_track_across_the_180th_meridian_is_cut() -> None:
-    assert cut([]) == [[]]
+    assert split_at_antimeridian([]) == [[]]
     for sign in (1.0, -1.0):
         way = [
             [sign * (180 - 1e-5), 35.0, 1.0],
             [sign * (-180 + 2e-5), 35.3, 4.0],
             [sign * (-180 + 3e-5), 35.4, 5.0],
         ]
-        one, two = cut(way)
+        one, two = split_at_antimeridian(way)
         assert one == [way[0], pytest.approx([sign * 180, 35.1, 2.0])]
         assert two == [pytest.approx([sign * -180, 35.1, 2.0]), way[1], way[2]]
 
