@@ -317,7 +317,7 @@ def test_a_turning_car_is_followed_through_a_gap(push: bool) -> None:
     estimates, sigmas = [], []
     for _ in range(9):
         fixes, log, truth, biases = turning_drive(rng, spec, push=push, rate_deg_s=45.0)
-        points = filter_fixes(fixes, spec, log.between)
+        points = filter_fixes(fixes, spec, log.motion_between)
         assert not any(p.misses for p in points)
         smooth = smooth_trajectory(points, spec)
         # 37 is the last fix before the gap, 38 the first one behind it.

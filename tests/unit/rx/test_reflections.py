@@ -5,7 +5,7 @@ from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-from rx_streams import LINK, frames_of, received
+from rx_streams import LINK, frames_of, receive_cut
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import PacketFormat
@@ -178,7 +178,7 @@ def test_two_bars_that_one_controller_feeds(share, farther_m):
         "bars": [fed | {"x_m": -1.5}, fed | {"x_m": 2.5, "z_m": farther_m}],
         "reflections": [rail] if share else [],
     }
-    receiver, packets = received(LINK, Events.concat(list(evlcp.simulate(scene, seed=4).chunks())))
+    receiver, packets = receive_cut(LINK, Events.concat(list(evlcp.simulate(scene, seed=4).chunks())))
     sides = [[f for f in frames_of(packets) if (f.x_px > 640) == right] for right in (False, True)]
     given = [[f for f in side if f.echo_of is None] for side in sides]
     assert [len(side) for side in given] == [23, 23]
