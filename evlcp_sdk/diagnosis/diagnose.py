@@ -19,7 +19,7 @@ from evlcp_sdk.io.open import open_source
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
-from evlcp_sdk.rx.boxes import inside
+from evlcp_sdk.rx.boxes import mask_inside
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events
 
@@ -193,7 +193,7 @@ def _trials(
     else:
         yield try_link(link, short)
     if len(sample) and not fits:
-        lights = [sample[inside(sample, one.box_px)] for one in sources[:_LIGHTS]]
+        lights = [sample[mask_inside(sample, one.box_px)] for one in sources[:_LIGHTS]]
         yield from infer_links(link, lights or [sample], registry)
 
 

@@ -291,7 +291,7 @@ class LightSurvey:
         left, top, _, _ = box
         sizes = []
         for window in self._windows:
-            within = boxes.inside(window, box)
+            within = boxes.mask_inside(window, box)
             if within.sum() >= 40:
                 ends = (np.bincount(window.x[within] - left), np.bincount(window.y[within] - top))
                 sizes.append([_extent(profile) for profile in ends])
@@ -305,7 +305,7 @@ class LightSurvey:
             return
         part = events[: int(np.searchsorted(events.t_us, start_us + _WINDOW_US))]
         swept = find_sweeps(part, start_us, _WINDOW_US, None, [], (self.width, self.height))
-        self._speeds.append(max((math.hypot(*one.speed) for one in swept), default=0.0))
+        self._speeds.append(max((math.hypot(*one.velocity_px_us) for one in swept), default=0.0))
         self._windows.append(part[part.p == 1][:_MOST_KEPT])
         if len(self._windows) > _MOST_WINDOWS:
             self._windows = self._windows[::2]

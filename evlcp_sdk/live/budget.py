@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.rx.boxes import inside
+from evlcp_sdk.rx.boxes import mask_inside
 from evlcp_sdk.values import Events, Region
 
 LEVELS: Final = (
@@ -92,7 +92,7 @@ class Shedder:
         for region in regions:
             left, right = _reach(region.x_px, region.width_px, self._size[0])
             top, bottom = _reach(region.y_px, region.height_px, self._size[1])
-            kept |= inside(
+            kept |= mask_inside(
                 events, (0, top, self._size[0], bottom) if rows_only else (left, top, right, bottom)
             )
         name = "rows_outside_regions" if rows_only else "empty_areas"

@@ -14,41 +14,31 @@ Array = NDArray[Any]
 Columns = tuple[Array, Array, Array, Array]
 """Of events: t_us, x, y and p."""
 
+# A pixel's state, uint32, from the lowest bit on: score, kind of its newest time, repetitions, clock.
+TIME_BIT, REPEATS_BIT, CLOCK_BIT = 6, 10, 15
 
-TIME_AT = 6
-"""Bit of a pixel's state from which its newest time is held; below: its score, from `CLOCK_AT`: its clock."""
+SCORE_MASK, MOST_REPEATS = 63, 31
 
-SAME_AT = 10
-"""Bit from which is held how often lately the same time came again, 0 to `MOST_SAME`."""
-
-MOST_SAME = 31
-
-CLOCK_AT = 15
-
-CLOCK_ROUND = 1 << 32 - CLOCK_AT
+CLOCK_TICKS = 1 << 32 - CLOCK_BIT
 """Ticks after which the clock of 17 bits goes round."""
 
-OTHER, AGAIN, MISSED, LONG = 0, 1, 2, 3
+OTHER_TIME, SAME_TIME, MULTIPLE_TIME, LONG_SAME_TIME = 0, 1, 2, 3
 """A time between rises: another than the one before; the same; as if one missed rises; the same, and long."""
 
-SCORES = (1 << TIME_AT) - 1
+_CLOCK_SHIFT, _TICK_MASK = np.uint32(CLOCK_BIT), np.uint32(CLOCK_TICKS - 1)
+_CLOCK_MASK = np.uint32((1 << 32) - (1 << CLOCK_BIT))
+_BELOW_CLOCK, _BELOW_REPEATS = np.uint32((1 << CLOCK_BIT) - 1), np.uint32((1 << REPEATS_BIT) - 1)
 
-_LOW = np.uint32((1 << CLOCK_AT) - 1)
-_HIGH = np.uint32((1 << 32) - (1 << CLOCK_AT))
-_PART = np.uint32((1 << SAME_AT) - 1)
-_SAMES = (
-    np.clip(np.add.outer([-6, 1, -2, 2], np.arange(MOST_SAME + 1)), 0, MOST_SAME).astype(np.uint32).ravel()
-)
-"""How often the same time has come again, after what the newest was and how often it was before: by the
-logarithm of how much likelier that is of a lamp that misses one rise in ten than of the code of a cluster
-whose pilot repeats itself, in units of what a repetition says, a third."""
-_CLOCK = np.uint32(CLOCK_AT)
+_REPEATS = np.add.outer([-6, 1, -2, 2], np.arange(MOST_REPEATS + 1)).clip(0, MOST_REPEATS).astype(np.uint32)
+"""Repetitions after each kind of time and number of them before. A kind counts by the logarithm of how much
+likelier it is of a lamp that misses one rise in ten than of the code of a cluster whose pilot repeats itself,
+in units of that of a repetition, a third."""
+
 _BLOCK = 32
-"""Events that are looked at together: of a bar alone in the dark, every other block has no stray in it."""
+"""Events that are compared together: of a bar alone in the dark, every other block has no stray in it."""
 
-_ROUND = np.uint32(CLOCK_ROUND - 1)
 _MOST_HITS = np.int16(2**15 - 1)
-"""What a cell's hits, two bytes, count no further than: of chips below 3 us there may be more in a step."""
+"""Hits of a cell, two bytes, count no further: with chips below 3 us there may be more in a step."""
 
 
 @njit
@@ -57,41 +47,47 @@ def score_rises(
     pixels: Array,
     hits: Array,
     kinds: Array,
-    lows: Array,
+    transitions: Array,
     limits: tuple[int, int, int],
     shifts: tuple[int, int],
-    old: tuple[int, int, int, int, int],
+    aging: tuple[int, int, int, int, int],
 ) -> int:
-    """Score each pixel by the rhythm of its rises; add those of candidates to their cell's `hits`; how many.
+    """Score each pixel by the rhythm of its rises; count those of candidates in their cell's `hits`.
 
-    `pixels` (height, width) are uint32, see `Rhythm`. A rise sooner than so many ticks after the one before,
-    the first of `limits`, is the same; `kinds` says what a number of ticks is, the last, 0, for all beyond,
-    and `lows` what becomes of time and score, and in the bits above whether it is `AGAIN` the same time. Of
-    `shifts`, a tick is 2^first us, a cell 2^second px wide. A rise with less than the least score is no hit,
-    nor is one beyond, or after the same time so often; these are the other `limits`.
+    Args:
+        events: Those of a step, in order.
+        pixels: States of the pixels, uint32 (height, width), see `BlinkDetector`.
+        hits: Takes the hits by cell, int16 (rows, columns).
+        kinds: Kind of a time by its ticks, the last, 0, for all beyond.
+        transitions: New time and score of a pixel, and in the bits above whether its time came again.
+        limits: (ticks below which a rise is the same as the one before; the least score of a hit; repetitions
+            of a time from which on a rise is no hit).
+        shifts: A tick is 2^first us, a cell 2^second px wide.
+        aging: What is old grows no older: (first row; number of rows from there on, cyclic; ticks now; ticks
+            after which a rise is old; its age then).
 
-    First, what is `old` grows no older: (first row; how many from there on, round and round; ticks now; how
-    many ticks ago a rise is old; how many ago it is then).
+    Returns:
+        Number of hits.
     """
-    first_row, many_rows, now, least_old, age = old
-    then = np.uint32((np.uint32(now) - np.uint32(age)) << _CLOCK)
-    today, oldest = np.uint32(now), np.uint32(least_old)
-    for row in range(first_row, first_row + many_rows):
+    first_row, row_count, now, old_ticks, age = aging
+    then = np.uint32((np.uint32(now) - np.uint32(age)) << _CLOCK_SHIFT)
+    today, oldest = np.uint32(now), np.uint32(old_ticks)
+    for row in range(first_row, first_row + row_count):
         line = pixels[row % len(pixels)]
         for u in range(line.size):
             state = line[u]
-            ago = np.uint32(np.uint32(today - np.uint32(state >> _CLOCK)) & _ROUND)
-            line[u] = np.uint32(then | np.uint32(state & _LOW)) if ago >= oldest else state
+            ago = np.uint32(np.uint32(today - np.uint32(state >> _CLOCK_SHIFT)) & _TICK_MASK)
+            line[u] = np.uint32(then | np.uint32(state & _BELOW_CLOCK)) if ago >= oldest else state
     t_us, x, y, p = events
-    soon, min_score, most_same = limits
+    least_ticks, min_score, most_repeats = limits
     tick_shift, cell_shift = shifts
     width, columns = np.uint32(pixels.shape[1]), np.uint32(hits.shape[1])
     states, cells = pixels.reshape(-1), hits.reshape(-1)
     longest, least = np.uint32(kinds.size - 1), np.uint32(min_score)
-    first, shift, ticks = np.uint32(soon), np.uint32(cell_shift), np.uint64(tick_shift)
-    lamp = np.uint32(most_same)
-    # What counts is as good as random at each stage, so that it is found without a branch; and indices are
-    # unsigned, as those below 0 would count from the end.
+    first, shift, ticks = np.uint32(least_ticks), np.uint32(cell_shift), np.uint64(tick_shift)
+    lamp = np.uint32(most_repeats)
+    # What counts is as good as random at each stage, so there is no branch; indices are unsigned, as those
+    # below 0 would count from the end.
     where, runs = np.empty(t_us.size + 1, np.uint32), np.empty(t_us.size + 1, np.uint32)
     n = np.uint64(0)
     for i in range(t_us.size):
@@ -106,9 +102,9 @@ def score_rises(
     for i in range(n):
         at, tick = where[i], runs[i]
         state = states[at]
-        run = (tick - (state >> _CLOCK)) & _ROUND
+        run = (tick - (state >> _CLOCK_SHIFT)) & _TICK_MASK
         fresh = run >= first
-        states[at] = (tick << _CLOCK) | (state & _LOW) if fresh else state
+        states[at] = (tick << _CLOCK_SHIFT) | (state & _BELOW_CLOCK) if fresh else state
         where[new] = at
         runs[new] = min(run, longest)
         new += np.uint64(fresh)
@@ -117,12 +113,12 @@ def score_rises(
         at = where[i]
         state = states[at]
         kind = np.uint32(kinds[runs[i]])
-        low = np.uint32(lows[(kind << np.uint32(SAME_AT)) | (state & _PART)])
-        same = (state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
-        same = _SAMES[(low >> np.uint32(SAME_AT) << np.uint32(CLOCK_AT - SAME_AT)) | same]
-        states[at] = (state & _HIGH) | (same << np.uint32(SAME_AT)) | (low & _PART)
-        # One that comes after long is no blinking yet, however a pixel blinked when a bar was there.
-        if (low & np.uint32(SCORES)) >= least and kind != np.uint32(0) and same < lamp:
+        low = np.uint32(transitions[(kind << np.uint32(REPEATS_BIT)) | (state & _BELOW_REPEATS)])
+        same = (state >> np.uint32(REPEATS_BIT)) & np.uint32(MOST_REPEATS)
+        same = _REPEATS[low >> np.uint32(REPEATS_BIT), same]
+        states[at] = (state & _CLOCK_MASK) | (same << np.uint32(REPEATS_BIT)) | (low & _BELOW_REPEATS)
+        # A rise after a long time is no blinking yet, however a pixel blinked when a bar was there.
+        if (low & np.uint32(SCORE_MASK)) >= least and kind != np.uint32(0) and same < lamp:
             row = at // width
             cell = (row >> shift) * columns + ((at - row * width) >> shift)
             cells[cell] += np.int16(cells[cell] < _MOST_HITS)
@@ -131,10 +127,12 @@ def score_rises(
 
 
 @njit
-def _blinks(state: int, now: int, span: int, least: int) -> bool:
-    """Whether a pixel rose in the last `span` ticks and has a score of `least` or more."""
-    age = (np.uint32(now) - (np.uint32(state) >> _CLOCK)) & _ROUND
-    return bool(age <= np.uint32(span)) and bool((np.uint32(state) & np.uint32(SCORES)) >= np.uint32(least))
+def _is_blinking(state: int, now: int, span: int, least: int) -> bool:
+    """Whether a pixel rose in the last `span` ticks and scores `least` or more."""
+    age = (np.uint32(now) - (np.uint32(state) >> _CLOCK_SHIFT)) & _TICK_MASK
+    return bool(age <= np.uint32(span)) and bool(
+        (np.uint32(state) & np.uint32(SCORE_MASK)) >= np.uint32(least)
+    )
 
 
 @njit
@@ -146,12 +144,19 @@ def measure_box(
     reach: float,
     rows: Array,
 ) -> tuple[int, float, int, int, float, float, float]:
-    """Where in a box pixels blink in the rhythm of the chips, and rose lately.
+    """Find where in a box pixels blink in the rhythm of the chips, and rose lately.
 
-    `awake` are (now, how many ticks ago a rise may be, the least score).
-    Columns count by what they have more than the `seam` outermost ones on the darker side: a halo, or lit
-    leaves; those that hold most within twice `reach` give the mean column, and rows count what they have
-    within `reach` of it. An edge row that holds fewer pixels than a full one counts by its share.
+    Columns count by their excess over the `seam` outermost ones on the darker side, which see a halo, or lit
+    leaves. Those that hold most within twice `reach` give the mean column; rows count their pixels within
+    `reach` of it. An edge row that holds fewer pixels than a full one counts by its share.
+
+    Args:
+        pixels: States, uint32 (height, width).
+        box: (left, top, right, bottom).
+        awake: (ticks now; ticks since which a pixel must have risen; its least score).
+        seam: Columns at either side of the box.
+        reach: Half the width of the bar, px; infinite if it is not known.
+        rows: Takes the pixels by row.
 
     Returns:
         (pixels, mean column, first column, last column, upper edge, lower edge, share of the pixels
@@ -164,7 +169,7 @@ def measure_box(
         many, cells = 0, 0
         for v in range(top, bottom, 2):
             for u in range(max(first, left), min(first + seam, right)):
-                many += _blinks(pixels[v, u], now, span, 0)
+                many += _is_blinking(pixels[v, u], now, span, 0)
                 cells += 1
         calm = min(calm, many / max(cells, 1))
     blinks, counts = np.empty((bottom - top, right - left), np.uint8), np.zeros(right - left, np.int32)
@@ -172,7 +177,7 @@ def measure_box(
         line, row = pixels[v, left:right], blinks[v - top]
         # Many pixels at a time, in one loop: rows are short.
         for u in range(line.size):
-            blink = _blinks(line[u], now, span, min_score)
+            blink = _is_blinking(line[u], now, span, min_score)
             row[u] = blink
             counts[u] += np.int32(blink)
     columns, first_column, last_column = np.empty(counts.size), right, left
@@ -213,7 +218,7 @@ def measure_box(
         lit += n > 0
     if total == 0:
         return 0, 0.0, 0, 0, 0.0, 0.0, calm
-    upper, lower = _edges_of(rows, top, bottom, total / lit)
+    upper, lower = _find_edges(rows, top, bottom, total / lit)
     return total, column, first_column, last_column, upper, lower, calm
 
 
@@ -227,19 +232,19 @@ def measure_strips(
     strips: Array,
     rows: Array,
 ) -> tuple[int, float, int, int, float, float, float]:
-    """Where in a box pixels blink, as `measure_box`, of a bar whose light stands in strips of columns.
+    """Find where in a box pixels blink, as `measure_box`, of a bar whose light stands in strips of columns.
 
-    `strips` (n, 2) are the middle of each from the bar's centre, and half its width, px. A pixel says how far
-    it is from the middle of its own strip: their mean does not go by how many each strip has awake, as the
-    mean column would. Within `near` of the strips about `expected` first, then about what that says, and
-    within the strips and a pixel; columns between them count nowhere.
+    `strips` (n, 2) are the middle of each from the bar's centre, and half its width, px. Each pixel counts by
+    its distance from the middle of its own strip: unlike the mean column, this does not depend on how many
+    pixels of each strip are awake. They count within `near` of the strips about the `expected` column first,
+    then within a pixel of the strips about the column found; columns between strips never count.
     """
     now, span, min_score = awake
     left, top, right, bottom = box
     columns, number = np.zeros(right - left), np.empty(right - left, np.int64)
     for v in range(top, bottom):
         for u in range(left, right):
-            columns[u - left] += _blinks(pixels[v, u], now, span, min_score)
+            columns[u - left] += _is_blinking(pixels[v, u], now, span, min_score)
     column, total = expected, 0.0
     for turn in range(3):
         more = near if turn == 0 else 1.0
@@ -266,17 +271,17 @@ def measure_strips(
     for v in range(top, bottom):
         n = 0
         for u in range(left, right):
-            n += number[u - left] >= 0 and _blinks(pixels[v, u], now, span, min_score)
+            n += number[u - left] >= 0 and _is_blinking(pixels[v, u], now, span, min_score)
         rows[v - top] = n
         many += n
         lit += n > 0
-    upper, lower = _edges_of(rows, top, bottom, many / lit)
+    upper, lower = _find_edges(rows, top, bottom, many / lit)
     return many, column, first_column, last_column, upper, lower, 0.0
 
 
 @njit
-def _edges_of(rows: Array, top: int, bottom: int, full: float) -> tuple[float, float]:
-    """Upper and lower edge of what rows (n,) hold: an edge row counts by its share of a full one."""
+def _find_edges(rows: Array, top: int, bottom: int, full: float) -> tuple[float, float]:
+    """Upper and lower edge of the rows (n,) with pixels: an edge row counts by its share of a full one."""
     v = top
     while rows[v - top] == 0:
         v += 1
@@ -289,7 +294,7 @@ def _edges_of(rows: Array, top: int, bottom: int, full: float) -> tuple[float, f
 
 @njit
 def select_box(events: Columns, box: tuple[int, int, int, int], out: Columns) -> int:
-    """Copy the events inside a box (left, top, right, bottom); how many. One more than all find room."""
+    """Copy the events inside a box to `out`, which has room for one more than all; return their number."""
     t_us, x, y, p = events
     out_t, out_x, out_y, out_p = out
     left, top = np.uint16(box[0]), np.uint16(box[1])
@@ -337,7 +342,7 @@ def select_box(events: Columns, box: tuple[int, int, int, int], out: Columns) ->
 
 
 MOST_BOXES = 16
-"""Boxes that events are handed to in one pass: a bit each."""
+"""Boxes that are served in one pass: a bit each."""
 
 _LOWEST = np.array([8, *((n & -n).bit_length() - 1 for n in range(1, 1 << 8))], np.uint8)
 """Number of the lowest of eight bits that is set; of none, one beyond."""
@@ -349,21 +354,27 @@ def select_boxes(
     boxes: Array,
     pixels: Array,
     rhythmic: tuple[int, int, int],
-    apart: int,
+    stride: int,
     out: Columns,
-    many: Array,
+    counts: Array,
 ) -> None:
-    """Copy the events inside each of some boxes (n, 4), `MOST_BOXES` at the most; how `many`, int64 (n,).
+    """Copy the events inside each of some boxes.
 
-    Of each box, they begin `apart` events behind where those of the one before do; behind all is room for one
-    more. `rhythmic` are (boxes of which only those in rhythm are meant, a bit each; the least score of
-    their pixels; how often, or more, the same time must not have come again).
+    Args:
+        events: Those of a step.
+        boxes: (left, top, right, bottom), int64 (n, 4), `MOST_BOXES` at the most.
+        pixels: States, uint32 (height, width).
+        rhythmic: (boxes of which only pixels in rhythm count, a bit each; the least score of these;
+            repetitions of a time from which on they do not count).
+        stride: The events of each box begin so many behind where those of the one before do.
+        out: Takes the events; it has room for one more than all.
+        counts: Takes the number of events by box, int64 (n,).
     """
     t_us, x, y, p = events
     out_t, out_x, out_y, out_p = out
-    # By a column's bits and a row's, boxes are found in the same time however many they are.
+    # A column's and a row's bits name the boxes, in the same time however many there are.
     columns, rows = np.zeros(pixels.shape[1], np.uint16), np.zeros(pixels.shape[0], np.uint16)
-    filtered, least, most_same = np.uint16(rhythmic[0]), np.uint32(rhythmic[1]), np.uint32(rhythmic[2])
+    filtered, least, most_repeats = np.uint16(rhythmic[0]), np.uint32(rhythmic[1]), np.uint32(rhythmic[2])
     for k in range(len(boxes)):
         left, top, right, bottom = boxes[k]
         for u in range(left, right):
@@ -372,13 +383,13 @@ def select_boxes(
             rows[v] |= np.uint16(1 << k)
     ends = np.empty(MOST_BOXES + 1, np.int64)
     for k in range(ends.size):
-        ends[k] = min(k, len(boxes)) * apart
+        ends[k] = min(k, len(boxes)) * stride
     for i in range(t_us.size):
         inside = columns[x[i]] & rows[y[i]]
         if inside & filtered:
             state = pixels[y[i], x[i]]
-            same = (state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
-            is_rhythmic = ((state & np.uint32(SCORES)) >= least) & (same < most_same)
+            same = (state >> np.uint32(REPEATS_BIT)) & np.uint32(MOST_REPEATS)
+            is_rhythmic = ((state & np.uint32(SCORE_MASK)) >= least) & (same < most_repeats)
             inside = inside if is_rhythmic else np.uint16(inside & ~filtered)
         while True:
             # Written always, kept if inside; of two boxes that overlap, in both.
@@ -395,7 +406,7 @@ def select_boxes(
             if not inside:
                 break
     for k in range(len(boxes)):
-        many[k] = ends[k] - k * apart
+        counts[k] = ends[k] - k * stride
 
 
 @njit
@@ -506,7 +517,7 @@ def count_rows(
 
 @njit
 def _collect_connected(selected: Array, done: Array, cells: Array, row: int, column: int) -> int:
-    """Collect a selected cell and those connected with it (8 neighbours) in `cells`; return how many."""
+    """List the selected cells that are connected (8 neighbours) with one; return their number."""
     rows, columns = selected.shape
     done[row, column] = True
     cells[0, 0], cells[0, 1] = row, column
@@ -524,10 +535,10 @@ def _collect_connected(selected: Array, done: Array, cells: Array, row: int, col
 
 
 @njit
-def areas(selected: Array, hits: Array, boxes: Array, total: Array) -> int:
-    """Rectangles (left, top, right, bottom) around connected cells (8 neighbours), and their hits.
+def bound_areas(selected: Array, hits: Array, boxes: Array, total: Array) -> int:
+    """Bound connected cells (8 neighbours) by `boxes` (left, top, right, bottom), with their `total` hits.
 
-    In the order of their first cells, by rows and columns. It returns how many there are.
+    They are in the order of their first cells, by rows and columns. Returns their number.
     """
     rows, columns = selected.shape
     done = np.zeros((rows, columns), np.bool_)
@@ -1730,36 +1741,36 @@ def assign_cells(
 
 
 @njit
-def places_at(
-    times: Array, start_us: float, unit_us: float, places: Array, ahead: float, centre: Array
+def interpolate_centres(
+    times: Array, start_us: float, unit_us: float, samples: Array, ahead: float, centre: Array
 ) -> None:
-    """Centre (2, m) at times (m,), on straight lines between `places` (5, n): times, columns, rows, ...
+    """Interpolate the `centre` (2, m) at `start_us + times * unit_us` (m,) on straight lines between samples.
 
-    Times are in units, from a start on.
-    Before the first place and after the last it goes on for `ahead` times as long as to its neighbour.
+    `samples` (5, n) are times, columns, rows, ... Beyond the first and the last one the line goes on for
+    `ahead` times the time to their neighbour.
     """
-    n = places.shape[1]
+    n = samples.shape[1]
     for a in range(2):
-        at = places[a + 1]
+        at = samples[a + 1]
         j = 0
         for i in range(times.size):
             if n == 1:
                 centre[a, i] = at[0]
                 continue
             t = start_us + times[i] * unit_us
-            while j > 0 and places[0, j] > t:
+            while j > 0 and samples[0, j] > t:
                 j -= 1
-            while j < n - 2 and places[0, j + 1] <= t:
+            while j < n - 2 and samples[0, j + 1] <= t:
                 j += 1
-            # The piece of the way that holds the time: from a place to the next, or beyond the outermost.
-            from_us, until_us, here, there = places[0, j], places[0, j + 1], at[j], at[j + 1]
+            # The piece of the way that holds the time: from a sample to the next, or beyond the outermost.
+            from_us, until_us, here, there = samples[0, j], samples[0, j + 1], at[j], at[j + 1]
             if t < from_us:
                 until_us, there = from_us, here
-                from_us -= ahead * (places[0, 1] - from_us)
+                from_us -= ahead * (samples[0, 1] - from_us)
                 here -= ahead * (at[1] - here)
             elif t >= until_us:
                 from_us, here = until_us, there
-                until_us += ahead * (until_us - places[0, n - 2])
+                until_us += ahead * (until_us - samples[0, n - 2])
                 there += ahead * (there - at[n - 2])
             t = min(max(t, from_us), until_us)
             centre[a, i] = (
@@ -1769,14 +1780,14 @@ def places_at(
 
 @njit
 def clear_cells(hits: Array, boxes: Array, cell_shift: int) -> int:
-    """Set the cells that boxes (n, left, top, right, bottom) of pixels touch to 0; what they had."""
-    had = 0
+    """Set the cells that boxes of pixels (n, 4) touch to 0; return the hits that they had."""
+    cleared = 0
     for left, top, right, bottom in boxes:
         for v in range(top >> cell_shift, min((bottom - 1 >> cell_shift) + 1, hits.shape[0])):
             for u in range(left >> cell_shift, min((right - 1 >> cell_shift) + 1, hits.shape[1])):
-                had += hits[v, u]
+                cleared += hits[v, u]
                 hits[v, u] = 0
-    return had
+    return cleared
 
 
 @njit

@@ -13,7 +13,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements, without
-from evlcp_sdk.rx.regions import MARGIN_PX, Followed
+from evlcp_sdk.rx.regions import MARGIN_PX, TrackedRegion
 from evlcp_sdk.values import Events, PresenceMap, SyncLock
 
 _LEAST_CLUSTERS = 0.5
@@ -145,7 +145,7 @@ class FrameAligner:
             np.arange(packet.frame_chips + self._after, dtype=np.float64) + 0.5
         )
 
-    def align(self, region: Followed, due: DueFrame, pilot: Pilot | None) -> AlignedFrame | None:
+    def align(self, region: TrackedRegion, due: DueFrame, pilot: Pilot | None) -> AlignedFrame | None:
         """Hold a frame's image still, and find its clusters; None if it does not show them.
 
         Args:
@@ -155,11 +155,11 @@ class FrameAligner:
         """
         lock, packet = due.lock, self._packet
         start_us, chip_us = float(due.start_us), float(lock.chip_us)
-        centre_px = region.positions.at(self._halves[: due.chips + self._after], start_us, chip_us)
+        centre_px = region.track.centres_at(self._halves[: due.chips + self._after], start_us, chip_us)
         middle = min(due.chips, packet.pilot_chips) // 2
         seen_us = due.middle_us + chip_us / 2
         if due.has_pilot:
-            size = self._size(*region.positions.size_at(seen_us))
+            size = self._size(*region.track.size_at(seen_us))
         elif pilot is None or pilot.frame != due.number - due.index + packet.pilot_frame(due.index):
             return None
         else:

@@ -14,12 +14,12 @@ from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.regions import (
     BACKFILL_STEPS,
-    Followed,
-    Places,
+    RegionTrack,
     RegionTracker,
-    held_bytes,
-    make_room,
-    same_place,
+    TrackedRegion,
+    drop_oldest_events,
+    is_same_place,
+    memory_bytes,
 )
 from evlcp_sdk.values import Events, Region
 
@@ -29,7 +29,7 @@ tracker: a slow light is known after its first character. Not more, as they are 
 when it is found, and a shaking camera has seen it elsewhere before."""
 
 
-class DetectedRegions(RegionTracker):
+class DetectorTracker(RegionTracker):
     """Holds the events of the regions that a detector gives; they stay where it has them."""
 
     def __init__(self, link: Link, limits: Limits = LIMITS) -> None:
@@ -45,10 +45,10 @@ class DetectedRegions(RegionTracker):
             self._state: Any = self._detector.init()
         self._recent: deque[tuple[int, Events]] = deque(maxlen=self._most_recent)
         self._left: frozenset[int] = frozenset()
-        self.alive: list[Followed] = []
+        self.alive: list[TrackedRegion] = []
         self.counts = {"regions_left_out": 0, "dropped_no_room": 0}
 
-    def step(self, start_us: int, events: Events, taken: Sequence[Region] = ()) -> list[Followed]:
+    def step(self, start_us: int, events: Events, occupied: Sequence[Region] = ()) -> list[TrackedRegion]:
         """Take the events of one time step; return the regions that are alive or ended in it."""
         with self._guard:
             given = self._detector.step(self._state, start_us, events)
@@ -58,7 +58,7 @@ class DetectedRegions(RegionTracker):
             self._guard.expect(region, Region)
             for name in ("x_px", "y_px", "width_px", "height_px"):
                 self._guard.expect_number(getattr(region, name), name, -1e6, 1e6)
-            if not any(same_place(region, place) for place in taken):
+            if not any(is_same_place(region, place) for place in occupied):
                 places[region.id] = replace(region, t_us=start_us + self._step_us / 2)
         # What was let go is not taken up again as long as the detector gives it.
         self._left &= {region.id for region in found}
@@ -69,36 +69,38 @@ class DetectedRegions(RegionTracker):
             followed.released |= followed.id not in places
         for id, place in places.items():
             if id in known:
-                known[id].positions.append(place)
+                known[id].track.append(place)
             elif len(self.alive) < self._limits.regions:
                 pieces = deque((begun, _inside(before, place)) for begun, before in self._recent)
                 first_us = pieces[0][0] if pieces else start_us
                 end_us = start_us + self._step_us
-                known[id] = Followed(id, Places([place]), first_us, pieces, opened_us=end_us)
+                known[id] = TrackedRegion(id, RegionTrack([place]), first_us, pieces, opened_us=end_us)
                 self.alive.append(known[id])
             else:
                 self.counts["regions_left_out"] += 1
         for followed in self.alive:
             followed.add(start_us, _inside(events, followed.latest))
-        self._remember(start_us, events)
-        self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, self._step_us)
+        self._store_step(start_us, events)
+        self.counts["dropped_no_room"] += drop_oldest_events(
+            self.alive, self._limits.region_bytes, self._step_us
+        )
         seen = list(self.alive)
         self.alive = [followed for followed in self.alive if not followed.released]
         return seen
 
-    def _remember(self, start_us: int, events: Events) -> None:
+    def _store_step(self, start_us: int, events: Events) -> None:
         """Keep a step's events, for regions that are found later, and what is before it within the limits."""
         while self._recent and self._recent[0][0] <= start_us - self._most_recent * self._step_us:
             self._recent.popleft()
         self._recent.append((start_us, events))
-        while sum(held_bytes(held) for _, held in self._recent) > self._limits.recent_bytes:
+        while sum(memory_bytes(held) for _, held in self._recent) > self._limits.recent_bytes:
             self._recent.popleft()
 
-    def skip(self) -> None:
+    def skip_gap(self) -> None:
         """Pass over a gap in time, with no region alive."""
         self._recent.clear()
 
-    def drop(self, followed: Followed) -> None:
+    def drop(self, followed: TrackedRegion) -> None:
         """Let a region go at once."""
         super().drop(followed)
         self._left |= {followed.id}

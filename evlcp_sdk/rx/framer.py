@@ -12,7 +12,7 @@ from evlcp_sdk.clock import CameraClock, TimeStep
 from evlcp_sdk.errors import EvlcpError, PluginError
 from evlcp_sdk.rx.guard import fault_text
 from evlcp_sdk.rx.limits import LIMITS, Limits
-from evlcp_sdk.rx.regions import Followed
+from evlcp_sdk.rx.regions import TrackedRegion
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Frame, Region, SyncLock, replace_fields
@@ -124,7 +124,7 @@ class Framer(ABC):
     patience_us: float
 
     @abstractmethod
-    def step(self, regions: list[Followed], step: TimeStep) -> None:
+    def step(self, regions: list[TrackedRegion], step: TimeStep) -> None:
         """Decode what the regions of a time step send."""
 
     def apply_pending(self, start_us: int) -> None:
@@ -136,11 +136,11 @@ class Framer(ABC):
         return
 
     @abstractmethod
-    def number_of(self, region: Followed) -> int | None:
+    def number_of(self, region: TrackedRegion) -> int | None:
         """Number of a region's transmitter; None before its first frame."""
 
     @abstractmethod
-    def forget_region(self, region: Followed) -> None:
+    def forget_region(self, region: TrackedRegion) -> None:
         """Forget a region that is no longer followed, as its place is another's."""
 
     def discard_misses(self, *, place: Region | None = None, number: int | None = None) -> int:

@@ -21,11 +21,11 @@ from evlcp_sdk.rx.regions import (
     MARGIN_PX,
     SAME_PX,
     STILL,
-    Followed,
-    RegionFollower,
+    BarPlace,
     RegionTracker,
-    ShownPlace,
-    same_place,
+    RhythmTracker,
+    TrackedRegion,
+    is_same_place,
 )
 from evlcp_sdk.rx.transmitters import (
     LOOKBACK_PACKETS,
@@ -153,7 +153,7 @@ class PacketFraming(Framer):
         stream: StreamContext,
         decoder: FrameDecoder,
         regions: RegionTracker,
-        follower: RegionFollower | None,
+        follower: RhythmTracker | None,
         queue: ReflectionQueue,
         on_frame: Callable[[Frame], None] | None,
     ) -> None:
@@ -183,7 +183,7 @@ class PacketFraming(Framer):
         self._dropped: set[int] = set()
         # Number, place and misses.
         self._ended: deque[tuple[int | None, tuple[float, float], Counter[str]]] = deque(maxlen=_MAX_ENDED)
-        self._due: deque[Followed] = deque()
+        self._due: deque[TrackedRegion] = deque()
         # Frames that end in one step, and how long it takes to decode those before a first lock.
         per_step = self._step_us / (link.packet.info_chips * link.packet.chip_us)
         self._max_due = math.ceil(per_step) + _MAX_OVERDUE
@@ -203,7 +203,7 @@ class PacketFraming(Framer):
         while self._pending and self._pending[0].step_us + _APPLY_AFTER_STEPS * self._step_us <= start_us:
             self._apply_frame(self._pending.popleft())
 
-    def step(self, regions: list[Followed], step: TimeStep) -> None:
+    def step(self, regions: list[TrackedRegion], step: TimeStep) -> None:
         """Synchronize with the regions of a time step and decode their frames."""
         self._dropped.clear()
         # A frame may show another image of its bar: that is a region, too, and decoded at once.
@@ -247,13 +247,13 @@ class PacketFraming(Framer):
         alive = self._transmitters.alive.values()
         due = [one for one in alive if one.grid.next_due(until_us) is not None and _can_decode_early(one)]
         region_ids = {one.region.id for one in due}
-        self._follower.begin_part(step.start_us, step.end_us, step.events, region_ids)
+        self._follower.begin_partial_step(step.start_us, step.end_us, step.events, region_ids)
         for transmitter in due:
             self._decode_early(transmitter, until_us)
-        self._follower.end_part(step.end_us)
+        self._follower.end_partial_step(step.end_us)
         self._update_due_time()
 
-    def number_of(self, region: Followed) -> int | None:
+    def number_of(self, region: TrackedRegion) -> int | None:
         """Number of a region's transmitter; None before its first frame."""
         transmitter = self._transmitters.alive.get(region.id)
         return None if transmitter is None else transmitter.number
@@ -262,12 +262,12 @@ class PacketFraming(Framer):
         """Discard the misses counted where another link's packet was, or for a number; return how many."""
         missed: Counter[str] = Counter()
         for one in self._transmitters.alive.values():
-            if one.number == number if place is None else same_place(one.region.latest, place):
+            if one.number == number if place is None else is_same_place(one.region.latest, place):
                 missed, one.missed = missed + one.missed, Counter()
         for ended in list(self._ended):
             ended_number, (x, y), ended_missed = ended
             if place is not None and ended_number is None:
-                matches = same_place(replace_fields(place, x_px=x, y_px=y), place)
+                matches = is_same_place(replace_fields(place, x_px=x, y_px=y), place)
             else:
                 matches = place is None and ended_number == number
             if matches:
@@ -285,7 +285,7 @@ class PacketFraming(Framer):
         for transmitter in self._transmitters.close():
             self._end_transmitter(transmitter, self._clock.last_us)
 
-    def _synchronize(self, region: Followed, step: TimeStep) -> Transmitter:
+    def _synchronize(self, region: TrackedRegion, step: TimeStep) -> Transmitter:
         """Synchronize with a region's events of a time step, or with all that it has if it is new."""
         transmitter, guard = self._transmitters.alive.get(region.id), self._sync_guard
         pieces: Iterable[tuple[int, Events]] = region.pieces if transmitter is None else (region.pieces[-1],)
@@ -333,15 +333,15 @@ class PacketFraming(Framer):
         self.counts["frames"] -= self._queue.end_frames_after(
             old.assembler, (packet - (old.first_packet or 0), frame)
         )
-        self._ended.append((old.number, old.region.positions.place_at(old.region.latest.t_us), old.missed))
+        self._ended.append((old.number, old.region.track.centre_at(old.region.latest.t_us), old.missed))
         return self._transmitters.replace(old)
 
     def _correct_row_delay(self, transmitter: Transmitter, lock: SyncLock) -> SyncLock:
         """Add to a lock the row delay of its bar, as measured in this preamble and those before."""
         region = transmitter.region
         middle_us = lock.packet_t_us + self._packet.preamble_chips / 2 * lock.chip_us
-        _, y_px = region.positions.place_at(middle_us)
-        _, height_px = region.positions.size_at(middle_us)
+        _, y_px = region.track.centre_at(middle_us)
+        _, height_px = region.track.size_at(middle_us)
         row_us, sigma_us = measure_row_delay(self._preamble, lock, region.pieces, y_px, height_px)
         if math.isfinite(row_us):
             transmitter.row_delay = transmitter.row_delay.update(row_us, sigma_us)
@@ -370,7 +370,7 @@ class PacketFraming(Framer):
 
     def _decode_due(self, transmitter: Transmitter, until_us: float, most: float = math.inf) -> None:
         """Decode the frames whose events are all there before a time, `most` at most."""
-        cut_us = transmitter.region.cut_us
+        cut_us = transmitter.region.forgotten_until_us
         if cut_us is not None and transmitter.grid.lock is not None:
             self.counts["frames_cut"] += transmitter.grid.skip_before(cut_us)
         while most > 0 and (due := transmitter.grid.next_due(until_us)) is not None:
@@ -498,7 +498,7 @@ class PacketFraming(Framer):
         A region that sweeps over the image is soon off by more than its seam: each of its frames has to
         correct it.
         """
-        still = transmitter.region.speed == STILL and self._follower is not None
+        still = transmitter.region.velocity_px_us == STILL and self._follower is not None
         return still and not transmitter.strayed and transmitter.number is not None
 
     def _submit_frame(self, transmitter: Transmitter, due: DueFrame) -> None:
@@ -543,7 +543,7 @@ class PacketFraming(Framer):
         region, shown, follower = transmitter.region, found.shown, self._follower
         assert follower is not None
         if shown is not None and not region.released:
-            follower.shape(region, shown)
+            follower.correct_region(region, shown)
             if not self._drop_duplicates(region, shown.t_us):
                 return
             self._open_other_images(region, shown)
@@ -551,12 +551,12 @@ class PacketFraming(Framer):
         self.counts["frames_not_ranged"] += due.has_pilot and not pending.ranged
         self._queue_frame(transmitter, due, self._build_detection(transmitter, due, found, frame))
 
-    def _open_other_images(self, region: Followed, shown: ShownPlace) -> None:
+    def _open_other_images(self, region: TrackedRegion, shown: BarPlace) -> None:
         assert self._follower is not None
         for centre_px, size_px in shown.others:
-            known = any(one.covers(shown.t_us, centre_px) for one in self._regions.alive)
+            known = any(one.covers_point(shown.t_us, centre_px) for one in self._regions.alive)
             if not known and self._follower.has_room():
-                self._due.append(self._follower.beside(region, shown.t_us, centre_px, size_px))
+                self._due.append(self._follower.open_duplicate(region, shown.t_us, centre_px, size_px))
 
     def _retime_frame(self, transmitter: Transmitter, due: DueFrame) -> DueFrame:
         """Time a frame that is due anew where the light has changed since the preamble."""
@@ -590,7 +590,7 @@ class PacketFraming(Framer):
     def _align_frame(self, transmitter: Transmitter, due: DueFrame) -> AlignedFrame | None:
         """Align a frame and correct its region by it; drop duplicates of the bar, open its other images."""
         region, follower = transmitter.region, self._follower
-        seen: list[ShownPlace] = []
+        seen: list[BarPlace] = []
         most_px = 0.0
         for _ in range(_MAX_ALIGNMENTS):
             bar_known = region.size_px is not None
@@ -604,26 +604,26 @@ class PacketFraming(Framer):
                 break
             # The next alignment may no longer see what this one shows beside the bar.
             seen.append(shown)
-            off_px = follower.shape(region, shown)
+            off_px = follower.correct_region(region, shown)
             most_px = max(most_px, off_px)
             if off_px > 0 and not self._drop_duplicates(region, shown.t_us):
                 return None
             # Within half of the seam, another alignment would not know the motion in the frame better.
             if off_px == 0 or (bar_known and off_px <= MARGIN_PX / 2):
                 break
-            follower.gather(region, due.start_us, due.read_us)
+            follower.gather_events(region, due.start_us, due.read_us)
         if follower is not None and most_px > MARGIN_PX / 2:
-            follower.gather(region)
+            follower.gather_events(region)
         if due.has_pilot:
             transmitter.strayed = most_px > MARGIN_PX / 2
         for shown in seen if aligned is not None else ():
             self._open_other_images(region, shown)
         return aligned
 
-    def _drop_duplicates(self, region: Followed, t_us: float) -> bool:
+    def _drop_duplicates(self, region: TrackedRegion, t_us: float) -> bool:
         """Drop other regions of a bar; if a known one has it already, drop this region and return False."""
         for other in list(self._regions.alive):
-            if other is region or not region.holds(other, t_us, SAME_PX):
+            if other is region or not region.includes_region(other, t_us, SAME_PX):
                 continue
             gone = region if other.size_px is not None and other.id < region.id else other
             self._regions.drop(gone)
@@ -638,11 +638,11 @@ class PacketFraming(Framer):
         if self._follower is None or transmitter.region.id in self._dropped or not parts:
             return False
         for part in parts:
-            self._follower.unite(transmitter.region, part.region)
+            self._follower.merge_regions(transmitter.region, part.region)
             self.forget_region(part.region)
         return True
 
-    def forget_region(self, region: Followed) -> None:
+    def forget_region(self, region: TrackedRegion) -> None:
         """Forget a region that has become a part of another, or whose place is another's."""
         self._dropped.add(region.id)
         transmitter = self._transmitters.alive.get(region.id)
@@ -657,7 +657,7 @@ class PacketFraming(Framer):
         """Count misses of a part of a bar apart from those of whole bars."""
         self.counts["frames_of_parts"] += self._uncount(missed)
 
-    def _claim_ended_parts(self, region: Followed, t_us: float) -> None:
+    def _claim_ended_parts(self, region: TrackedRegion, t_us: float) -> None:
         """Find regions that ended and were parts of a bar whose first frame is decoded."""
         for one in list(self._ended):
             number, place_px, missed = one
@@ -677,7 +677,7 @@ class PacketFraming(Framer):
             return
         number, missed = transmitter.number, transmitter.missed
         if missed:
-            place_px = transmitter.region.positions.place_at(seen_us)
+            place_px = transmitter.region.track.centre_at(seen_us)
             bars = [one for one in self._regions.alive if one is not transmitter.region and one.size_px]
             if number is None and any(_is_part(bar, seen_us, place_px, self._fade_us) for bar in bars):
                 self._count_as_parts(missed)
@@ -695,10 +695,10 @@ def _can_decode_early(transmitter: Transmitter) -> bool:
     return known and not transmitter.is_behind and transmitter.last_tried != transmitter.grid.frame
 
 
-def _is_part(bar: Followed, t_us: float, place_px: tuple[float, float], fade_us: float) -> bool:
+def _is_part(bar: TrackedRegion, t_us: float, place_px: tuple[float, float], fade_us: float) -> bool:
     """Whether what was seen somewhere may have been a part of a bar, or its fading trail."""
-    (x, y), before = bar.positions.place_at(t_us), bar.positions.place_at(t_us - fade_us)
-    width, height = bar.positions.size_at(t_us)
+    (x, y), before = bar.track.centre_at(t_us), bar.track.centre_at(t_us - fade_us)
+    width, height = bar.track.size_at(t_us)
     right, down = abs(place_px[0] - x) - abs(before[0] - x), abs(place_px[1] - y) - abs(before[1] - y)
     return right <= width / 2 + _PART_MARGIN_PX and down <= height / 2 + _PART_MARGIN_PX
 
@@ -708,4 +708,4 @@ def _is_dark(transmitter: Transmitter, due: DueFrame, packet: PacketFormat) -> b
     if transmitter.number is None or pilot is None:
         return False
     expected = int(np.abs(pilot.sums).sum(dtype=np.int64)) * due.chips / packet.pilot_chips
-    return transmitter.region.events_between(due.start_us, due.end_us) < _DARK_SHARE * expected
+    return transmitter.region.count_events(due.start_us, due.end_us) < _DARK_SHARE * expected

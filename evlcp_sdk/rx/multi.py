@@ -7,7 +7,7 @@ symbols are right, by their LLRs: seconds of light are the same for all links, h
 have. A transmitter that explains half of its light holds its place: other links let their regions there go.
 """
 
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -15,8 +15,8 @@ import numpy as np
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.rx.regions import same_place
-from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.rx.regions import is_same_place
+from evlcp_sdk.rx.rhythm import BlinkDetector
 from evlcp_sdk.values import Frame, Packet, Region, replace_fields
 
 _CLEARLY = 1.25
@@ -194,7 +194,7 @@ class SeveralLinks:
         )
         here = _grown(replace_fields(one.place, x_px=a.x_px, y_px=a.y_px), self._gap_px)
         there = _grown(replace_fields(other.place, x_px=b.x_px, y_px=b.y_px), self._gap_px)
-        return same_place(here, there)
+        return is_same_place(here, there)
 
 
 def _grown(place: Region, by_px: float) -> Region:
@@ -260,17 +260,16 @@ class EarlyFrames:
         return {key for key, frame in over.items() if key[0] == packet.packet and frame is None}
 
 
-def shared_rhythms(links: Mapping[str, Link]) -> dict[str, Rhythm]:
-    """Scores of the pixels for links whose rhythms agree, by name: one pass over the events for all."""
-    alike: dict[tuple[float, int, int], list[str]] = {}
-    for name, link in links.items():
-        key = link.packet.chip_us, link.regions.min_score, link.codebook.longest_gap_chips
-        alike.setdefault(key, []).append(name)
-    camera = next(iter(links.values())).camera
-    return {
-        name: rhythm
-        for (chip_us, min_score, gap_chips), names in alike.items()
-        if len(names) > 1
-        for rhythm in [Rhythm(camera.width, camera.height, chip_us, min_score, gap_chips, shared=True)]
-        for name in names
+def share_detectors(links: Mapping[str, Link]) -> dict[str, BlinkDetector]:
+    """One detector for all links with the same rhythm, by the name of each; none for others."""
+    rhythms = {
+        name: (link.packet.chip_us, link.regions.min_score, link.codebook.longest_gap_chips)
+        for name, link in links.items()
     }
+    camera = next(iter(links.values())).camera
+    detectors = {
+        rhythm: BlinkDetector(camera.width, camera.height, *rhythm, is_shared=True)
+        for rhythm, number in Counter(rhythms.values()).items()
+        if number > 1
+    }
+    return {name: detectors[rhythm] for name, rhythm in rhythms.items() if rhythm in detectors}

@@ -13,7 +13,7 @@ from evlcp_sdk.plugin.roles import Deframer
 from evlcp_sdk.rx.framer import Framer, StreamContext, record_light
 from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.reflections import FrameDetection, PacketAssembler, ReflectionQueue
-from evlcp_sdk.rx.regions import Followed
+from evlcp_sdk.rx.regions import TrackedRegion
 from evlcp_sdk.values import DecodedFrame, Frame, Range
 
 _COUNTS = "events_in_regions", "events_in_regions_on", "regions_opened", "regions_released", "frames"
@@ -38,7 +38,7 @@ class _DeframedRegion:
         last: Packet and number of that frame.
     """
 
-    region: Followed
+    region: TrackedRegion
     state: Any
     assembler: PacketAssembler
     number: int | None = None
@@ -79,7 +79,7 @@ class PluginFraming(Framer):
         self.light_spans_us: dict[int, tuple[float, float]] = {}
         self.ranging_every = 1
 
-    def step(self, regions: list[Followed], step: TimeStep) -> None:
+    def step(self, regions: list[TrackedRegion], step: TimeStep) -> None:
         """Decode what the regions of a time step send."""
         for region in regions:
             deframed = self._deframed.get(region.id)
@@ -105,12 +105,12 @@ class PluginFraming(Framer):
                 self._end_region(deframed)
                 del self._deframed[region.id]
 
-    def number_of(self, region: Followed) -> int | None:
+    def number_of(self, region: TrackedRegion) -> int | None:
         """Number of a region's transmitter; None before its first frame."""
         deframed = self._deframed.get(region.id)
         return None if deframed is None else deframed.number
 
-    def forget_region(self, region: Followed) -> None:
+    def forget_region(self, region: TrackedRegion) -> None:
         """Forget a region whose place is another's."""
         deframed = self._deframed.pop(region.id, None)
         if deframed is not None:
@@ -140,7 +140,7 @@ class PluginFraming(Framer):
                 deframed.number = next(self._numbers)
             chips = self._packet.info_chips + self._packet.has_pilot(decoded.frame) * self._packet.pilot_chips
             end_us = decoded.t_us + chips * decoded.chip_us
-            x, y = deframed.region.positions.at(np.array([(decoded.t_us + end_us) / 2]))
+            x, y = deframed.region.track.centres_at(np.array([(decoded.t_us + end_us) / 2]))
             frame = Frame(
                 transmitter=deframed.number,
                 packet=decoded.packet,

@@ -18,7 +18,7 @@ from evlcp_sdk.rx.guard import Guard, compiled, tracker_of
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
-from evlcp_sdk.rx.regions import MARGIN_PX, Followed, ShownPlace
+from evlcp_sdk.rx.regions import MARGIN_PX, BarPlace, TrackedRegion
 from evlcp_sdk.rx.spread import LateSpread, Spread, neighbours
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.tilt import LineOfSight, line_of_sight, magnification_of
@@ -220,7 +220,7 @@ class FrameResult(NamedTuple):
     seen: int
     mirrored: bool
     is_readable: bool
-    shown: ShownPlace | None = None
+    shown: BarPlace | None = None
 
 
 class FrameJob(NamedTuple):
@@ -233,7 +233,7 @@ class FrameJob(NamedTuple):
         ranged: Its distance is measured.
     """
 
-    region: Followed
+    region: TrackedRegion
     due: DueFrame
     attitude: Attitude | None
     ranged: bool
@@ -362,17 +362,17 @@ class FrameDecoder:
             return None
         shown = self.locate_bar(aligned) if due.has_pilot else None
         # Within half of the seam, all events are there.
-        if shown is not None and region.off_px(shown) > MARGIN_PX / 2:
+        if shown is not None and region.deviation_px(shown) > MARGIN_PX / 2:
             return None
         found, state = self.read(aligned, due, state, job.attitude, ranged=job.ranged)
         return (found._replace(shown=shown), state) if found.is_readable else None
 
-    def locate_bar(self, aligned: AlignedFrame) -> ShownPlace:
+    def locate_bar(self, aligned: AlignedFrame) -> BarPlace:
         """Where a frame with a pilot shows its bar."""
         aligner, pilot = self.aligner, aligned.pilot
         box = aligner.box(aligned, pilot.placement)
         others = tuple(aligner.box(aligned, other) for other in pilot.others)
-        return ShownPlace(aligned.middle_us, *box, aligner.lit_rows(aligned), aligner.strips(aligned), others)
+        return BarPlace(aligned.middle_us, *box, aligner.lit_rows(aligned), aligner.strips(aligned), others)
 
     def read(
         self,

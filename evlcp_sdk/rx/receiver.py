@@ -12,18 +12,18 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
 from evlcp_sdk.plugin.roles import STEPS
-from evlcp_sdk.rx.detected import DetectedRegions
+from evlcp_sdk.rx.detected import DetectorTracker
 from evlcp_sdk.rx.framer import Announcer, Framer, StreamContext, to_camera_time
 from evlcp_sdk.rx.framing import PacketFraming
 from evlcp_sdk.rx.guard import tracker_of
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits
-from evlcp_sdk.rx.multi import EarlyFrames, SeveralLinks, shared_rhythms
+from evlcp_sdk.rx.multi import EarlyFrames, SeveralLinks, share_detectors
 from evlcp_sdk.rx.plugin_framing import PluginFraming
 from evlcp_sdk.rx.reading import FrameDecoder
 from evlcp_sdk.rx.reflections import ReflectionQueue, Reflections
-from evlcp_sdk.rx.regions import RegionFollower, RegionTracker, same_place
-from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.rx.regions import RegionTracker, RhythmTracker, is_same_place
+from evlcp_sdk.rx.rhythm import BlinkDetector
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.rx.workers import Workers
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
@@ -104,7 +104,7 @@ class Receiver:
         if len(links) == 1:
             self._receivers = [LinkReceiver(first, "", stream, None, on_frame)]
         else:
-            rhythms, tell = shared_rhythms(links), None if on_frame is None else self._decoded
+            rhythms, tell = share_detectors(links), None if on_frame is None else self._decoded
             self._receivers = [
                 LinkReceiver(one, name, stream, rhythms.get(name), tell) for name, one in links.items()
             ]
@@ -253,16 +253,16 @@ class LinkReceiver:
         link: Link,
         name: str,
         stream: StreamContext,
-        rhythm: Rhythm | None,
+        rhythm: BlinkDetector | None,
         on_frame: Callable[[Frame], None] | None,
     ) -> None:
         self.name = name
         self._clock, self._announcer = stream.clock, stream.announcer
         tracker = tracker_of(link)
         self._regions: RegionTracker
-        follower: RegionFollower | None = None
+        follower: RhythmTracker | None = None
         if link.algorithm("detection").rhythmic:
-            self._regions = follower = RegionFollower(
+            self._regions = follower = RhythmTracker(
                 link.regions,
                 link.camera,
                 link.packet.chip_us,
@@ -273,7 +273,7 @@ class LinkReceiver:
                 rhythm,
             )
         else:
-            self._regions = DetectedRegions(link, stream.limits)
+            self._regions = DetectorTracker(link, stream.limits)
         self._queue = ReflectionQueue(Reflections(link.packet, len(link.codebook.codewords)))
         self.framing: Framer
         if link.algorithm("framing").roles >= STEPS:
@@ -315,32 +315,32 @@ class LinkReceiver:
         return bool(self._regions.alive or self._queue)
 
     def step(
-        self, step: TimeStep, taken: Sequence[Region] = (), owning: Collection[int] = ()
+        self, step: TimeStep, occupied: Sequence[Region] = (), owning: Collection[int] = ()
     ) -> list[Packet]:
         """Follow the regions through a time step; receive and decode what they send.
 
         `taken` are places that other links hold, `owning` the numbers of the transmitters that own theirs.
         """
         if step.after_gap:
-            self._regions.skip()
-        if taken:
-            self._leave(taken, owning)
+            self._regions.skip_gap()
+        if occupied:
+            self._leave(occupied, owning)
         if self._announcer is not None:
             self._announcer.start_clock()
         self.framing.apply_pending(step.start_us)
-        regions = self._regions.step(step.start_us, step.events, taken)
+        regions = self._regions.step(step.start_us, step.events, occupied)
         if self._announcer is not None:
             for region in regions:
                 self._announcer.announce("regions", region.latest)
         self.framing.step(regions, step)
         return self._queue.step()
 
-    def _leave(self, taken: Sequence[Region], owning: Collection[int]) -> None:
+    def _leave(self, occupied: Sequence[Region], owning: Collection[int]) -> None:
         """Let regions go in places that are others', but for those of transmitters that own theirs."""
         for region in list(self._regions.alive):
             if self.framing.number_of(region) in owning:
                 continue
-            if any(same_place(region.latest, place) for place in taken):
+            if any(is_same_place(region.latest, place) for place in occupied):
                 self._regions.drop(region)
                 self.framing.forget_region(region)
 

@@ -1,24 +1,23 @@
-"""Which pixels blink in the rhythm of the chips.
+"""Detect pixels that blink in the rhythm of the chips.
 
 The rhythm is judged per pixel, from rise to rise: the times at which it starts to get brighter. In a pair
-code rises come two, three or four chips apart, and where events go missing a few chips more, but whole
-chips always. So a rise two to four whole chips after the one before raises a pixel's score by two, one after
-five to twelve by one; of other codes, up to the longest time that there is in them, and up to three times
-that. A rise off the chips, as of a lamp with pulse width modulation of 4 kHz (two and a half chips) or of a
-moving texture, lowers it by three: more than the two that chance, which is on the chips in six cases of ten,
-would bring. One after the very same number of chips as before lowers it by two from five chips on: a lamp of
-1 or 2 kHz repeats its period, a code with missing events does not.
-A lamp whose period is near two, three or four chips is in rhythm, too, as far as a score tells; but its time
-comes again and again, to half a chip, or twice or three times as long where it misses a rise, while a code
-changes to another soon. That is counted as a likelihood ratio: up by one a repetition, by two from four chips
-on, down by two where rises may have been missed, by six for another time. Pixels with some of that open no
-region, and with more, before a frame shows where the bar is, they are not listened to. Falls are not looked
-at: they come later or sooner than rises by the light, they are the first to go missing, and some cameras send
-none.
+code rises come two, three or four chips apart, and where events go missing a few chips more, but whole chips
+always. So a rise two to four whole chips after the one before raises a pixel's score by two, one after five
+to twelve by one; of other codes, up to the longest gap that there is in them, and up to three times that. A
+rise off the chips, as of a lamp with pulse width modulation of 4 kHz (two and a half chips) or of a moving
+texture, lowers it by three: more than the two that chance, which is on the chips in six cases of ten, would
+bring. One after the very same number of chips as before lowers it by two from five chips on: a lamp of 1 or 2
+kHz repeats its period, a code with missing events does not. A lamp whose period is near two, three or four
+chips is in rhythm, too, as far as the score tells; but its time comes again and again, to half a chip, or
+twice or three times as long where it misses a rise, while a code changes to another soon. That is counted as
+a likelihood ratio: up by one a repetition, by two from four chips on, down by two where rises may have been
+missed, by six for another time. Pixels with some repetitions open no region, and those with more are ignored
+before a frame shows where the bar is. Falls are not used: they come later or sooner than rises by the light,
+they are the first to go missing, and some cameras send none.
 
 A pixel that a bar has left keeps its score, as it hardly rises any more; but where the camera shakes, the
-veil around the bar comes nearer again, and all pixels of the trail rise once, with a chip. So a region is
-opened by rises only that come soon after the one before. One pass, four bytes a pixel.
+veil around the bar comes nearer again, and all pixels of the trail rise once, with a chip. So only rises that
+come soon after the one before open a region. One pass, four bytes a pixel.
 """
 
 import math
@@ -35,64 +34,65 @@ from evlcp_sdk.rx.boxes import Box
 from evlcp_sdk.values import Events
 
 _MOST_SCORE = 40
-"""Scores rise no further: what has blinked in rhythm for long is forgotten after so many rises off it."""
+"""Limit of scores, so that a long rhythm is forgotten after so many rises off it."""
 
-_SOON_CHIPS = 1.5
-"""Rises come no sooner in any code; what does is more events of the same rise."""
+_LEAST_CHIPS = 1.5
+"""Least time between rises in any code; sooner events are of the same rise."""
 
 _MOST_CHIPS = 15
-"""A longer time says nothing, nor one of three times the longest of the code: events were missed."""
+"""Longest time that counts, as does none beyond three times the longest gap of the code: events were
+missed."""
 
-_STRAY_CHIPS = 0.3
-"""Jitter and latencies that differ from rise to rise put one off the chips by so much."""
+_JITTER_CHIPS = 0.3
+"""Deviation of rises from whole chips by jitter and latencies that differ from rise to rise."""
 
 _LONGEST_TICKS = 2**15
-"""Of what is looked up by its length: a tick is 1 us but for chips slower than 190 a second."""
+"""Size of the tables by ticks: a tick is 1 us except for chips slower than 190 a second."""
 
-SAME, LAMP = 7, 14
-"""Repetitions of a time, less what speaks against a lamp, from which on a pixel opens no region, and from
-which on it is not listened to before a frame shows where the bar is. Pixels that see a random code are so
-for five per cent of the time by the first, which a bar can spare, as its other clusters open the region; and
-for one by the second, but for nine of the one pilot of sixteen that is two chips throughout. A lamp that
-misses one rise in ten is so by both for more than half of the time, one that misses none always. More
-repetitions would spare more of a code, and take longer to know a panel, which costs the frames before."""
+OPENING_REPEATS, LAMP_REPEATS = 7, 14
+"""Repetitions of a time, less the evidence against a lamp, from which on a pixel opens no region, and from
+which on it is ignored before a frame shows where the bar is. Pixels that see a random code are so for five
+per cent of the time by the first, which a bar can spare, as its other clusters open the region; and for one
+by the second, but for nine of the one pilot of sixteen that is two chips throughout. A lamp that misses one
+rise in ten is so by both for more than half of the time, one that misses none always. More repetitions would
+spare more of a code, and take longer to know a panel, which costs the frames before."""
 
-_LATE, _OFF = 0, 16
-"""Kind of a time between rises: see `_TIMES`, or 0 beyond; so much more where it is off the chips."""
+_LATE, _OFF_CHIPS = 0, 16
+"""Kind of a time beyond all of `_TIMES`; and what is added to the kind of one off the chips."""
 
 _TIMES = (1.5, 2.0, 2.5, 3.0, 3.5, 4.0, *map(float, range(5, 14)))
-"""Times between rises that are told apart, by their kinds from 1 on, chips, the last with all beyond. Short
-ones by halves: where many pixels switch at once, the readout puts rises off by a quarter of a chip, and a
-period of 2.3 chips is now two and now three."""
+"""Times between rises that are distinguished, chips, by their kinds from 1 on, the last with all beyond.
+Short ones by halves: where many pixels switch at once, the readout puts rises off by a quarter of a chip, and
+a period of 2.3 chips is now two and now three."""
 
-_LONG = 6
+_FIRST_LONG = 6
 """Kinds from this one on, four chips, count twice where they are repeated: a code does so half as often."""
 
-_SHORT = 6
-"""Kinds up to this one are next to each other where they differ by half a chip: the same time, maybe. Those
-of a pair code are whole chips apart."""
+_LAST_SHORT = 6
+"""Neighbours among the kinds up to this one differ by half a chip, and may be the same time. Those of a pair
+code are whole chips apart."""
 
 
 @dataclass(frozen=True, eq=False)
-class RhythmTables:
-    """What the times between rises of some chips say, looked up by a time's ticks.
+class BlinkTables:
+    """How times between rises count, by their ticks.
 
     Attributes:
         tick_shift: A tick is 2^this us.
-        soon: Ticks before which a rise is the same.
-        kinds: Kind of a time, the last for all beyond, uint8 (ticks,).
-        lows: See `_lows`.
+        least_ticks: Ticks below which a rise is the same as the one before.
+        kinds: Kind of a time by its ticks, the last for all beyond, uint8 (ticks,).
+        transitions: See `_build_transitions`.
     """
 
     tick_shift: int
-    soon: int
+    least_ticks: int
     kinds: NDArray[np.uint8]
-    lows: NDArray[np.uint16]
+    transitions: NDArray[np.uint16]
 
     @classmethod
     @lru_cache(maxsize=4)
-    def of(cls, chip_us: float, gap_chips: int) -> "RhythmTables":
-        """By the length of a chip, us, and the longest time from rise to rise in the codes, chips."""
+    def of(cls, chip_us: float, gap_chips: int) -> "BlinkTables":
+        """Tables for a length of chips, us, and the longest time from rise to rise in the codes, chips."""
         late_us = (min(3 * gap_chips, _MOST_CHIPS) + 0.5) * chip_us
         shift = max(math.ceil(math.log2(late_us / _LONGEST_TICKS)), 0)
         tick_us = 1 << shift
@@ -100,55 +100,59 @@ class RhythmTables:
         chips = np.floor(run_us / chip_us + 0.5)
         middles = np.array(_TIMES)
         kinds = 1 + np.searchsorted((middles[1:] + middles[:-1]) / 2 * chip_us, run_us, side="right")
-        kinds += _OFF * (np.abs(run_us - chips * chip_us) > _STRAY_CHIPS * chip_us)
+        kinds += _OFF_CHIPS * (np.abs(run_us - chips * chip_us) > _JITTER_CHIPS * chip_us)
         kinds[run_us > late_us] = _LATE
-        return cls(shift, int(_SOON_CHIPS * chip_us) >> shift, kinds.astype(np.uint8), _lows(gap_chips))
+        least_ticks = int(_LEAST_CHIPS * chip_us) >> shift
+        return cls(shift, least_ticks, kinds.astype(np.uint8), _build_transitions(gap_chips))
 
 
-def _lows(gap_chips: int) -> NDArray[np.uint16]:
+def _build_transitions(gap_chips: int) -> NDArray[np.uint16]:
     """Time and score of a pixel after a rise, by the kind of its time and by time and score before it.
 
-    The bits above say whether it is the same time again, or rises may have been missed in one of the two.
+    The bits above are the relation of the two times, see `_relate_times`.
     """
-    kind, before, score = np.meshgrid(np.arange(2 * _OFF), np.arange(16), np.arange(64), indexing="ij")
-    time = kind % _OFF
+    kind, before, score = np.meshgrid(np.arange(2 * _OFF_CHIPS), np.arange(16), np.arange(64), indexing="ij")
+    time = kind % _OFF_CHIPS
     chips = np.array([0.0, *_TIMES])[time]
     change = np.where(chips < gap_chips + 1, 2, np.where(time == before, -2, 1))
-    change[kind >= _OFF] = -3
+    change[kind >= _OFF_CHIPS] = -3
     change[kind == _LATE] = -1
-    said = _repeats()[before, time]
-    return np.asarray((said << 10) | (time << 6) | np.clip(score + change, 0, _MOST_SCORE), np.uint16).ravel()
+    low = (time << _kernels.TIME_BIT) | np.clip(score + change, 0, _MOST_SCORE)
+    return np.asarray((_relate_times()[before, time] << _kernels.REPEATS_BIT) | low, np.uint16).ravel()
 
 
-def _repeats() -> NDArray[np.int64]:
-    """What a time says after another, by the kinds of both: `_kernels.AGAIN`, `LONG`, `MISSED` or `OTHER`.
+def _relate_times() -> NDArray[np.int64]:
+    """Relations of two times by their kinds, such as `_kernels.SAME_TIME`.
 
-    One of them may be two or three of the other, of which rises in between were missed.
+    One may be two or three times the other, of which rises in between were missed.
     """
-    said = np.full((16, 16), _kernels.OTHER)
-    ends = [_SOON_CHIPS, *((a + b) / 2 for a, b in pairwise(_TIMES)), _TIMES[-1] + 0.5]
+    relations = np.full((16, 16), _kernels.OTHER_TIME)
+    ends = [_LEAST_CHIPS, *((a + b) / 2 for a, b in pairwise(_TIMES)), _TIMES[-1] + 0.5]
     for shorter in range(1, len(_TIMES) + 1):
+        same = _kernels.LONG_SAME_TIME if shorter >= _FIRST_LONG else _kernels.SAME_TIME
         for longer in range(shorter, len(_TIMES) + 1):
-            same = longer == shorter or (longer == shorter + 1 and longer <= _SHORT)
-            multiple = any(
-                many * ends[shorter - 1] < ends[longer] and ends[longer - 1] < many * ends[shorter]
-                for many in (2, 3)
-            )
-            again = _kernels.LONG if shorter >= _LONG else _kernels.AGAIN
-            what = again if same else _kernels.MISSED if multiple else _kernels.OTHER
-            said[shorter, longer] = said[longer, shorter] = what
-    return said
+            relation = _kernels.OTHER_TIME
+            if longer == shorter or (longer == shorter + 1 and longer <= _LAST_SHORT):
+                relation = same
+            elif any(
+                times * ends[shorter - 1] < ends[longer] and ends[longer - 1] < times * ends[shorter]
+                for times in (2, 3)
+            ):
+                relation = _kernels.MULTIPLE_TIME
+            relations[shorter, longer] = relations[longer, shorter] = relation
+    return relations
 
 
 _SEAM_PX = 2
 """Columns at either side of a box that a bar should leave dark: some of the least seam of a region."""
 
 
-class Rhythm:
-    """Scores of a sensor's pixels, one uint32 each, whose bits `_kernels` names.
+class BlinkDetector:
+    """Scores the pixels of a sensor by the rhythm of their rises; selects events and places by these scores.
 
-    Their clock of 17 bits goes round in an eighth of a second. Rows are looked at in turn, where rises so
-    long ago that all such times are alike become the youngest of these; and so soon that none looks young.
+    A pixel's state is a uint32, whose bits `_kernels` names. Its clock of 17 bits goes round in an eighth of
+    a second. So rows are visited in turn, and rises so long ago that all such times are alike are moved to
+    the youngest of these times, soon enough that none looks young.
 
     Args:
         width: Columns of the sensor.
@@ -156,7 +160,7 @@ class Rhythm:
         chip_us: Nominal length of a chip, us.
         min_score: Score at which a pixel is a candidate; half of it is enough inside a region.
         gap_chips: The longest time from rise to rise in the codes; 4 in pair codes.
-        shared: Several followers ask for the same steps; the first one's answer is kept for the others.
+        is_shared: Several trackers ask for the same steps: the first answer is kept for the others.
     """
 
     def __init__(
@@ -167,102 +171,98 @@ class Rhythm:
         min_score: int,
         gap_chips: int = 4,
         *,
-        shared: bool = False,
+        is_shared: bool = False,
     ) -> None:
-        self._tables = RhythmTables.of(chip_us, gap_chips)
+        self._tables = BlinkTables.of(chip_us, gap_chips)
         self._shift = self._tables.tick_shift
         self._min_score = min_score
         self._pixels = np.zeros((height, width), np.uint32)
-        # No time that is looked up is longer; nor are rows looked at one by one after so long a gap.
-        self._turn = _kernels.CLOCK_ROUND // 4
+        # Longer than any time that counts; after so long a gap all rows are visited at once.
+        self._turn = _kernels.CLOCK_TICKS // 4
         self._old = self._turn + self._turn // 8
-        self._every = _kernels.CLOCK_ROUND - self._turn - self._old
-        self._row = 0
-        self._seen: int | None = None
-        self._open_us, self._taken, self._rises = -1, 0, 0
-        self._shared = shared
+        self._visit_ticks = _kernels.CLOCK_TICKS - self._turn - self._old
+        self._next_row = 0
+        self._now: int | None = None
+        self._step_us, self._done, self._hits = -1, 0, 0
+        self._is_shared = is_shared
         # Where events are selected into, box by box.
         self._columns: _kernels.Columns = (np.empty(0),) * 4
-        self._kept: tuple[tuple[int, int], int, NDArray[np.int16]] | None = None
+        self._answer: tuple[tuple[int, int], int, NDArray[np.int16]] | None = None
 
     def step(self, start_us: int, events: Events, hits: NDArray[np.int16], cell_shift: int) -> int:
-        """Take the events of a time step; add the rises of candidates to their cell's `hits`; how many.
+        """Score the rises of a time step; return the number of rises of candidates, and count them in `hits`.
 
         Args:
             start_us: Start of the step, us.
             events: Those in it, in order; a part of a step comes again with the rest, and counts once.
-            hits: Of cells of 2^cell_shift px, int16 (rows, columns).
-            cell_shift: See there.
+            hits: Counts by cell of 2^cell_shift px, int16 (rows, columns).
+            cell_shift: See `hits`.
         """
-        if self._kept is not None and self._kept[0] == (start_us, len(events)):
-            hits[:] = self._kept[2]
-            return self._kept[1]
-        old = self._row, 0, 0, 0, self._old
-        if start_us != self._open_us:
-            self._open_us, self._taken, self._rises = start_us, 0, 0
+        if self._answer is not None and self._answer[0] == (start_us, len(events)):
+            hits[:] = self._answer[2]
+            return self._answer[1]
+        aging = self._next_row, 0, 0, 0, self._old
+        if start_us != self._step_us:
+            self._step_us, self._done, self._hits = start_us, 0, 0
             # As many rows as the time since the last step asks for, all after a gap.
             now, height = start_us >> self._shift, len(self._pixels)
-            passed = self._turn if self._seen is None else now - self._seen
-            whole = passed >= self._turn
-            many = height if whole else -(-height * passed // self._every)
-            old = self._row, many, now, 0 if whole else self._old, self._old
-            self._row, self._seen = (self._row + many) % height, now
-        first, tables = self._taken, self._tables
+            ticks = self._turn if self._now is None else now - self._now
+            is_gap = ticks >= self._turn
+            rows = height if is_gap else -(-height * ticks // self._visit_ticks)
+            aging = self._next_row, rows, now, 0 if is_gap else self._old, self._old
+            self._next_row, self._now = (self._next_row + rows) % height, now
+        first, tables = self._done, self._tables
         newest = events.t_us[first:], events.x[first:], events.y[first:], events.p[first:]
-        limits, shifts = (tables.soon, self._min_score, SAME), (self._shift, cell_shift)
-        self._rises += _kernels.score_rises(
-            newest, self._pixels, hits, tables.kinds, tables.lows, limits, shifts, old
+        limits, shifts = (tables.least_ticks, self._min_score, OPENING_REPEATS), (self._shift, cell_shift)
+        self._hits += _kernels.score_rises(
+            newest, self._pixels, hits, tables.kinds, tables.transitions, limits, shifts, aging
         )
-        self._taken = events.t_us.size
-        if self._shared:
-            self._kept = (start_us, len(events)), self._rises, hits.copy()
-        return self._rises
+        self._done = events.t_us.size
+        if self._is_shared:
+            self._answer = (start_us, len(events)), self._hits, hits.copy()
+        return self._hits
 
     def select(
-        self, events: Events, boxes: Sequence[Box], rhythmic: Sequence[bool], most_same: int = LAMP
+        self, events: Events, boxes: Sequence[Box], rhythmic: Sequence[bool], most_repeats: int = LAMP_REPEATS
     ) -> list[Events]:
-        """Those inside each of some boxes (left, top, right, bottom), copied.
+        """Copy the events inside each of some boxes.
 
         Where leaves move, chance takes a third of their pixels to half of a candidate's score, and a tenth to
         all of it.
 
         Args:
             events: Those of a step.
-            boxes: Which boxes.
-            rhythmic: Of which of them only those of candidates are meant that are no lamps.
-            most_same: How often a candidate's time must not have come again.
+            boxes: (left, top, right, bottom) of each.
+            rhythmic: Boxes of which only candidates' events are selected that are no lamps.
+            most_repeats: Repetitions of a time from which on a candidate is a lamp.
         """
         most = _kernels.MOST_BOXES
         if len(boxes) > most:
-            first = self.select(events, boxes[:most], rhythmic[:most], most_same)
-            return first + self.select(events, boxes[most:], rhythmic[most:], most_same)
-        columns, apart = (events.t_us, events.x, events.y, events.p), events.t_us.size
-        room = len(boxes) * apart + 1
+            first = self.select(events, boxes[:most], rhythmic[:most], most_repeats)
+            return first + self.select(events, boxes[most:], rhythmic[most:], most_repeats)
+        columns, stride = (events.t_us, events.x, events.y, events.p), events.t_us.size
+        room = len(boxes) * stride + 1
         if room > self._columns[0].size:
             room += room // 4
-            into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
-            self._columns = into
+            x, y = np.empty((2, room), np.uint16)
+            self._columns = np.empty(room, np.int64), x, y, np.empty(room, np.uint8)
+        counts = np.empty(len(boxes), np.int64)
         if len(boxes) == 1 and not rhythmic[0]:
             # Of a bar alone, whole blocks of events.
-            ends = [_kernels.select_box(columns, boxes[0], self._columns)]
+            counts[0] = _kernels.select_box(columns, boxes[0], self._columns)
         else:
-            filtered = sum(one << k for k, one in enumerate(rhythmic)), self._min_score, most_same
-            numbers = np.empty(len(boxes), np.int64)
+            limits = sum(one << k for k, one in enumerate(rhythmic)), self._min_score, most_repeats
             _kernels.select_boxes(
-                columns, np.array(boxes), self._pixels, filtered, apart, self._columns, numbers
+                columns, np.array(boxes), self._pixels, limits, stride, self._columns, counts
             )
-            ends = numbers.tolist()
-        t_us, x, y, p = self._columns
-        begin, found = 0, []
-        for many in ends:
-            end = begin + many
-            inside = t_us[begin:end].copy(), x[begin:end].copy(), y[begin:end].copy(), p[begin:end].copy()
-            found.append(Events.from_columns(*inside))
-            begin += apart
-        return found
+        selected = []
+        for k, count in enumerate(counts.tolist()):
+            part = slice(k * stride, k * stride + count)
+            selected.append(Events.from_columns(*(column[part].copy() for column in self._columns)))
+        return selected
 
-    def of(self, events: Events) -> Events:
-        """Those of candidates that are no lamps."""
+    def select_rhythmic(self, events: Events) -> Events:
+        """Copy the events of candidates that are no lamps."""
         height, width = self._pixels.shape
         return self.select(events, [(0, 0, width, height)], [True])[0]
 
@@ -275,7 +275,7 @@ class Rhythm:
         rows: NDArray[np.int64],
         strips: tuple[float, float, NDArray[np.float64]] | None,
     ) -> tuple[int, float, int, int, float, float, float]:
-        """Where in a box pixels blink that rose in the last `span_us`, see `_kernels.measure_box`.
+        """Find where in a box pixels blink that rose in the last `span_us`, see `_kernels.measure_box`.
 
         `strips` are (expected, near, strips) of `_kernels.measure_strips` for a bar whose light stands in
         strips of columns, None for others.

@@ -23,7 +23,7 @@ from evlcp_sdk.rx.alignment import DueFrame
 from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.reading import BarDecoder, BarState
 from evlcp_sdk.rx.reflections import MAX_ROW_US, PacketAssembler
-from evlcp_sdk.rx.regions import Followed, Places
+from evlcp_sdk.rx.regions import RegionTrack, TrackedRegion
 from evlcp_sdk.values import Events, SyncLock, replace_fields
 
 LOOKBACK_PACKETS = 2
@@ -245,7 +245,7 @@ class Transmitter:
         decoder: Decodes its frames and has its state; None while that is here.
     """
 
-    region: Followed
+    region: TrackedRegion
     sync: Any
     state: BarState
     assembler: PacketAssembler
@@ -296,7 +296,7 @@ class Transmitters:
         self._released: list[Transmitter] = []
         self._numbers = numbers
 
-    def open(self, region: Followed, sync: Any, state: BarState) -> Transmitter:
+    def open(self, region: TrackedRegion, sync: Any, state: BarState) -> Transmitter:
         """Add a new region, with the first states of its synchronization and its frames."""
         assembler = PacketAssembler(self._packet.frames)
         transmitter = Transmitter(region, sync, state, assembler, self._new_grid())
@@ -398,8 +398,8 @@ class Transmitters:
         """Remember a transmitter whose region has ended, without its events."""
         region = transmitter.region
         del self.alive[region.id]
-        region.hold(deque())
-        region.positions = Places([region.latest])
+        region.replace_pieces(deque())
+        region.track = RegionTrack([region.latest])
         transmitter.sync, transmitter.state = None, transmitter.fetch_state()._replace(pilot=None)
         oldest_us = region.latest.t_us - _REMEMBER_US
         kept = [one for one in self._released if one.region.latest.t_us > oldest_us]

@@ -28,7 +28,7 @@ from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import DueFrame
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.reading import BarDecoder, BarState, FrameDecoder, FrameJob, FrameResult, LocalBarDecoder
-from evlcp_sdk.rx.regions import EVENT_BYTES, Followed, Places
+from evlcp_sdk.rx.regions import EVENT_BYTES, RegionTrack, TrackedRegion
 from evlcp_sdk.values import Events, Region, SyncLock
 
 _ROOM_BYTES: Final = 1 << 26
@@ -244,7 +244,7 @@ class _WorkerBars:
         """See `BarDecoder`."""
         region, due = job.region, job.due
         pieces, room = self._worker.placed(region.pieces_between(due.start_us, due.read_us, self._step_us))
-        bare = Followed(region.id, region.positions, region.first_us, size_px=region.size_px)
+        bare = TrackedRegion(region.id, region.track, region.first_us, size_px=region.size_px)
         return self._worker.ask("decode", self._link, bar, (job._replace(region=bare), pieces), room=room)
 
 
@@ -349,8 +349,8 @@ def load_kernels(link: Link) -> None:
     decoder = FrameDecoder(link)
     bars = LocalBarDecoder(decoder)
     for some in (events, events[rng.random(len(events)) < _FEW]):
-        region = Followed(
-            0, Places([Region(0, t, middle.real, middle.imag, *ends) for t in (0.0, due.end_us)]), 0
+        region = TrackedRegion(
+            0, RegionTrack([Region(0, t, middle.real, middle.imag, *ends) for t in (0.0, due.end_us)]), 0
         )
         region.size_px = ends
         region.add(0, some)

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from evlcp_sdk import _kernels as shared_kernels
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.rx.rhythm import BlinkDetector
 from evlcp_sdk.values import Events
 
 WIDTH, HEIGHT = 24, 16
@@ -17,14 +17,14 @@ SEEDS = range(5)
 
 def states(rose_us, time, score, same=0):
     """Pixels of these last rises, us, numbers of the times before, scores, and how often the same again."""
-    clock = np.asarray(rose_us) % _kernels.CLOCK_ROUND << _kernels.CLOCK_AT
-    again = np.asarray(same) << _kernels.SAME_AT
-    return (clock | again | np.asarray(time) << _kernels.TIME_AT | score).astype(np.uint32)
+    clock = np.asarray(rose_us) % _kernels.CLOCK_TICKS << _kernels.CLOCK_BIT
+    again = np.asarray(same) << _kernels.REPEATS_BIT
+    return (clock | again | np.asarray(time) << _kernels.TIME_BIT | score).astype(np.uint32)
 
 
 def rhythm_of(pixels, chip_us=100.0, min_score=8):
-    rhythm = Rhythm(WIDTH, HEIGHT, chip_us, min_score)
-    rhythm._pixels, rhythm._seen = pixels, 0
+    rhythm = BlinkDetector(WIDTH, HEIGHT, chip_us, min_score)
+    rhythm._pixels, rhythm._now = pixels, 0
     return rhythm
 
 
@@ -44,11 +44,11 @@ def test_times_count_alike_at_every_chip_rate(chip_us):
     start_us, pixels = 5_000_000_000_000, np.zeros((HEIGHT, WIDTH), np.uint32)
     for chips, score in ((2, 2), (4.2, 2), (5, 1), (7, -2), (7.5, -3), (12, 1), (14, -1)):
         rhythm = rhythm_of(pixels, chip_us)
-        rhythm._seen = start_us >> rhythm._shift
-        pixels[:] = states(rhythm._seen, 9, 10)
+        rhythm._now = start_us >> rhythm._shift
+        pixels[:] = states(rhythm._now, 9, 10)
         rise = Events.of([start_us + round(chips * chip_us)], [3], [2], [1])
         rhythm.step(start_us, rise, np.zeros((4, 6), np.int16), 2)
-        assert pixels[2, 3] & _kernels.SCORES == 10 + score, chips
+        assert pixels[2, 3] & _kernels.SCORE_MASK == 10 + score, chips
 
 
 def test_a_bar_is_measured_beside_light_that_is_everywhere():

@@ -12,7 +12,7 @@ from evlcp_sdk.clock import Timeline
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.rx.regions import EVENT_BYTES, PIECE_BYTES, RegionFollower
+from evlcp_sdk.rx.regions import EVENT_BYTES, PIECE_BYTES, RhythmTracker
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import Events
@@ -31,7 +31,7 @@ def blobs(columns, rows, until_us):
 
 def step_follower(events, until_us, **limits):
     """A follower with these limits after each step of a stream."""
-    regions = RegionFollower(SPEC, CameraModel(), LINK.packet.chip_us, None, KEEP_US, Limits(**limits))
+    regions = RhythmTracker(SPEC, CameraModel(), LINK.packet.chip_us, None, KEEP_US, Limits(**limits))
     for start_us, part in steps(events, until_us):
         regions.step(start_us, part)
         yield regions
@@ -87,11 +87,11 @@ def test_the_oldest_events_of_regions_are_forgotten():
         held = [bytes_of(one.pieces) for one in regions.alive]
         # What came in the last step is checked at its end.
         assert sum(held) <= 150_000 + 20 * (PIECE_BYTES + 1000 * EVENT_BYTES)
-        assert [one.held_bytes for one in regions.alive] == held
+        assert [one.memory_bytes for one in regions.alive] == held
     assert regions.counts["dropped_no_room"] > 0
-    cut = [one for one in regions.alive if one.cut_us is not None]
+    cut = [one for one in regions.alive if one.forgotten_until_us is not None]
     assert cut
-    assert all(one.pieces[0][0] == one.cut_us == one.first_us for one in cut)
+    assert all(one.pieces[0][0] == one.forgotten_until_us == one.first_us for one in cut)
     free = [(sum(bytes_of(one.pieces) for one in r.alive), r.counts) for r in step_follower(events, 40_000)]
     assert max(held for held, _ in free) > 400_000
     assert free[-1][1]["dropped_no_room"] == 0

@@ -9,10 +9,10 @@ from rx_streams import LINK, lamp_events, lit, noise_events, steps
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import RegionSpec
-from evlcp_sdk.rx.boxes import clear_of, cut_off
-from evlcp_sdk.rx.regions import Places, RegionFollower, ShownPlace
-from evlcp_sdk.rx.rhythm import Rhythm
-from evlcp_sdk.rx.sweeps import find_sweeps, fit_sweep, with_chips
+from evlcp_sdk.rx.boxes import cut_neighbours, subtract_boxes
+from evlcp_sdk.rx.regions import BarPlace, RegionTrack, RhythmTracker
+from evlcp_sdk.rx.rhythm import BlinkDetector
+from evlcp_sdk.rx.sweeps import find_sweeps, fit_sweep, has_chip_rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events
@@ -24,7 +24,7 @@ CENTRE, SIZE = (BAR.x_px - 0.5, BAR.y_px - 0.5), (4.0, 128.0)
 
 
 def follower(spec=SPEC, **options):
-    return RegionFollower(spec, CameraModel(), LINK.packet.chip_us, **options)
+    return RhythmTracker(spec, CameraModel(), LINK.packet.chip_us, **options)
 
 
 def step_regions(regions, events, until_us):
@@ -67,7 +67,7 @@ def test_a_shaking_bar_is_followed(shake_px, shake_hz):
     assert {t.id for found in by_step.values() for t in found} == {0}
     (region,) = by_step[99_000]
     at = np.arange(5000.0, 99_000.0, 500.0)
-    (x, y), (true_x, true_y) = region.positions.at(at), bar.centre(at)
+    (x, y), (true_x, true_y) = region.track.centres_at(at), bar.centre(at)
     assert np.sqrt(np.mean((x - true_x + 0.5) ** 2)) < 0.6
     assert np.sqrt(np.mean((y - true_y + 0.5) ** 2)) < 0.8
 
@@ -76,7 +76,7 @@ def test_a_shaking_bar_is_followed(shake_px, shake_hz):
 def test_a_bar_that_leaves_the_image_fast_is_let_go(way):
     """The filter's prediction runs on off the sensor until the region is released."""
     kalman = load_link(overrides=["tracking.id=kalman"]).algorithm("tracking").compile()
-    regions = follower(position=kalman.position)
+    regions = follower(centre_filter=kalman.position)
     moved_px = np.rint(9e-3 * np.maximum(BAR_EVENTS.t_us - 15_000, 0)).astype(np.int64)
     x = BAR_EVENTS.x + way[0] * moved_px + {1: 800, 0: 0, -1: -350}[way[0]]
     y = BAR_EVENTS.y + way[1] * moved_px
@@ -97,7 +97,7 @@ def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_a
     for start, found in step_regions(regions, merged(BAR_EVENTS[~hidden], raise_events(leaf, 9)), 60_000):
         if start == 12_000:
             (region,) = found
-            regions.shape(region, ShownPlace(region.latest.t_us, CENTRE, SIZE, (-64.0, 32.0)))
+            regions.correct_region(region, BarPlace(region.latest.t_us, CENTRE, SIZE, (-64.0, 32.0)))
         elif start > 12_000:
             assert region.latest.y_px == pytest.approx(CENTRE[1], abs=1.5), start
 
@@ -165,10 +165,10 @@ def test_a_code_is_hardly_taken_for_a_lamp(jitter_us):
 
 def in_rhythm(events, until_us):
     """Of each step its start, us, the events of pixels in the rhythm of the chips, and all."""
-    rhythm = Rhythm(1280, 720, LINK.packet.chip_us, SPEC.min_score)
+    rhythm = BlinkDetector(1280, 720, LINK.packet.chip_us, SPEC.min_score)
     for start, part in steps(events, until_us):
         rhythm.step(start, part, np.zeros((180, 320), np.int16), 2)
-        yield start, rhythm.of(part), part
+        yield start, rhythm.select_rhythmic(part), part
 
 
 def test_a_region_takes_its_bars_size_and_gathers_its_events():
@@ -177,18 +177,18 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events():
     regions = follower(keep_us=50_000)
     *_, (_, (region, *_)) = step_regions(regions, kept, 25_000)
     before = sum(len(e) for _, e in region.pieces)
-    assert regions.shape(region, ShownPlace(24_000.0, CENTRE, SIZE)) == np.inf
-    assert region.positions.place_at(24_000.0) == pytest.approx(CENTRE)
+    assert regions.correct_region(region, BarPlace(24_000.0, CENTRE, SIZE)) == np.inf
+    assert region.track.centre_at(24_000.0) == pytest.approx(CENTRE)
     old = list(region.pieces)
-    regions.gather(region, 18_000.5, 21_000)
+    regions.gather_events(region, 18_000.5, 21_000)
     for (start, now), (_, then) in zip(region.pieces, old, strict=True):
         assert (now is not then) == (start < 21_000 and start + 1_000 > 18_000.5)
-    regions.gather(region)
+    regions.gather_events(region)
     within = (kept.t_us >= region.pieces[0][0]) & (kept.t_us < 25_000)
     assert sum(len(e) for _, e in region.pieces) == int(within.sum()) >= before
     x, y = CENTRE
-    assert regions.shape(region, ShownPlace(24_000.0, (x + 0.1, y), (4.0, 128.2))) == 0
-    assert regions.shape(region, ShownPlace(24_000.0, (x + 1, y), (4.0, 131.0))) == pytest.approx(3)
+    assert regions.correct_region(region, BarPlace(24_000.0, (x + 0.1, y), (4.0, 128.2))) == 0
+    assert regions.correct_region(region, BarPlace(24_000.0, (x + 1, y), (4.0, 131.0))) == pytest.approx(3)
 
 
 def test_a_region_does_not_go_on_to_the_bar_below():
@@ -200,10 +200,10 @@ def test_a_region_does_not_go_on_to_the_bar_below():
         if start == 10_000:
             (own,) = found
             t_us = own.latest.t_us
-            regions.shape(own, ShownPlace(t_us, CENTRE, SIZE))
-            other = regions.beside(own, t_us, below, SIZE)
-            own.positions = Places(
-                replace(p, y_px=p.y_px + 7 * k) for k, p in enumerate(own.positions, 1 - len(own.positions))
+            regions.correct_region(own, BarPlace(t_us, CENTRE, SIZE))
+            other = regions.open_duplicate(own, t_us, below, SIZE)
+            own.track = RegionTrack(
+                replace(p, y_px=p.y_px + 7 * k) for k, p in enumerate(own.track, 1 - len(own.track))
             )
         elif start > 10_000:
             assert own.latest.y_px == pytest.approx(CENTRE[1], abs=1)
@@ -227,7 +227,7 @@ def test_a_region_does_not_go_on_to_the_bar_below():
 )
 def test_what_other_bars_cut_off(others, left):
     """Of a box with a seam of 5 px around a bar."""
-    assert cut_off((0, 0, 30, 100), (5, 5, 25, 95), others) == left
+    assert cut_neighbours((0, 0, 30, 100), (5, 5, 25, 95), others) == left
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def test_what_other_bars_cut_off(others, left):
     ],
 )
 def test_the_part_of_a_box_that_is_clear_of_others(others, clear):
-    assert clear_of((0, 0, 20, 100), others) == clear
+    assert subtract_boxes((0, 0, 20, 100), others) == clear
 
 
 def test_of_two_regions_that_follow_the_same_the_older_stays():
@@ -250,8 +250,8 @@ def test_of_two_regions_that_follow_the_same_the_older_stays():
     for start, found in step_regions(regions, BAR_EVENTS, 15_000):
         if start == 10_000:
             (first,) = found
-            regions.shape(first, ShownPlace(first.latest.t_us, CENTRE, SIZE))
-            regions.beside(first, first.latest.t_us, (CENTRE[0], CENTRE[1] + 3), SIZE)
+            regions.correct_region(first, BarPlace(first.latest.t_us, CENTRE, SIZE))
+            regions.open_duplicate(first, first.latest.t_us, (CENTRE[0], CENTRE[1] + 3), SIZE)
     assert regions.alive == [first]
 
 
@@ -304,10 +304,11 @@ def test_what_lies_on_no_line_is_no_sweep():
 
 
 def test_only_what_comes_with_the_chips_is_a_bar():
-    assert with_chips(line(0.005), BOX, 100.0)
-    assert not any(with_chips(line(0.005, rhythmic=False, seed=seed), BOX, 100.0) for seed in range(20))
+    assert has_chip_rhythm(line(0.005), BOX, 100.0)
+    assert not any(has_chip_rhythm(line(0.005, rhythmic=False, seed=seed), BOX, 100.0) for seed in range(20))
     (found,) = find_sweeps(line(0.005), 30_000, SWEEP_US, 100.0, [], IMAGE_PX)
-    assert (found.x_px, found.speed[0]) == (pytest.approx(600, abs=1), pytest.approx(0.005, abs=2e-4))
+    assert found.x_px == pytest.approx(600, abs=1)
+    assert found.velocity_px_us == (pytest.approx(0.005, abs=2e-4), 0)
     assert find_sweeps(line(0.005, rhythmic=False), 30_000, SWEEP_US, 100.0, [], IMAGE_PX) == []
     assert find_sweeps(line(0.001), 30_000, SWEEP_US, 100.0, [], IMAGE_PX) == []
     assert find_sweeps(line(0.005), 30_000, SWEEP_US, 100.0, [(590, 290, 610, 310)], IMAGE_PX) == []
