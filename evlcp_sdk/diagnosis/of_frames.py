@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Found, in_ms
 from evlcp_sdk.diagnosis.tallies import SURE, TransmitterTally, count_missing_codewords
-from evlcp_sdk.rx.straight import ALIKE, err_together
+from evlcp_sdk.rx.distortion import CORRELATED_FRAMES, are_correlated
 from evlcp_sdk.suggestions import format_count
 
 FEW_FRAMES = 10
@@ -383,21 +383,21 @@ def check_bent(facts: Facts, one: TransmitterTally) -> Found:
     seen = np.flatnonzero(one.bent_px[0] >= FEW_FRAMES)
     count, total, squares = one.bent_px[:, seen]
     mean_px = total / count
-    noise_px = np.sqrt(np.maximum(squares / count - mean_px**2, 0) * ALIKE / count)
+    noise_px = np.sqrt(np.maximum(squares / count - mean_px**2, 0) * CORRELATED_FRAMES / count)
     off = np.abs(mean_px) > np.maximum(_STANDING_OFF * noise_px, _STANDING_PX)
     if not off.any():
         return
     # A boundary moves towards the cluster that lacks light there.
     clusters = ", ".join(map(str, sorted({*(seen + (mean_px > 0))[off].tolist()})))
-    most_px, together = float(np.abs(mean_px).max()), err_together(mean_px)
+    most_px, correlated = float(np.abs(mean_px).max()), are_correlated(mean_px)
     most_cm = most_px * 100 * one.median_m() / facts.link.camera.focal_px
     yield Diagnostic(
         "image-bent",
         f"its image is bent in {one.bent} of {one.ranged} frames (their sigma {one.bent_sigma_m:.2g} m):"
         f" clusters {clusters} by up to {most_px:.2f} px, {most_cm:.1f} cm at the bar,"
-        f" {'neighbours alike' if together else 'each by itself'}",
+        f" {'neighbours alike' if correlated else 'each by itself'}",
         "clean what is before the camera: drops and uneven glass do this"
-        if together
+        if correlated
         else "look for LEDs of theirs that are dark, or hidden",
     )
 

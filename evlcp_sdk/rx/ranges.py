@@ -1,4 +1,4 @@
-"""A transmitter's distances together: when they hold, how the bar leans, and how much they scatter."""
+"""Corrects a transmitter's distances by those before: for time, tilt, pixel phase, distortion and scatter."""
 
 import math
 from typing import NamedTuple
@@ -7,15 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.straight import ALIKE, STRAIGHT, WAVE_PX, Image, judge_image
+from evlcp_sdk.rx.distortion import (
+    CORRELATED_FRAMES,
+    PHASE_BIAS_PX,
+    UNDISTORTED,
+    Distortion,
+    assess_distortion,
+)
 from evlcp_sdk.scene.tilt import LineOfSight
 from evlcp_sdk.values import Curvature, Range
 
 _MEMORY_S = 0.3
-"""Distances that are looked back on: a bicycle's swerve or a brake changes the acceleration in no less."""
+"""Time over which distances are fitted: a bicycle's swerve or a brake takes longer to change acceleration."""
 
 _SPEED_M_S = 20.0
-"""Speeds at which distances change before any is measured (sigma): 72 km/h."""
+"""Speeds before any is measured (sigma): 72 km/h."""
 
 _ACCELERATION_M_S2 = 3.0
 """Accelerations (sigma): a hard brake has 8."""
@@ -23,202 +29,200 @@ _ACCELERATION_M_S2 = 3.0
 _SCATTER_WORTH = 8.0
 """Frames that the sigmas of a ranging are worth against the scatter of its distances."""
 
-_OUTLIER = 4.0
-"""Sigmas from the others, 1 of 16000 by chance, beyond which how far off a distance is becomes its sigma."""
+_OUTLIER_SIGMAS = 4.0
+"""Sigmas off the others, 1 of 16000 by chance, beyond which a distance's offset becomes its sigma."""
 
-_LEAST_SIGMA = 1e-6
-"""Of the distance: ideal images have less, which says nothing of anything."""
+_MIN_SIGMA_SHARE = 1e-6
+"""Least sigma, as a share of the distance: ideal images have less, which means nothing."""
 
-_LEVEL_DEG, _LEANING_DEG, _LEANING_SHARE = 0.7, 5.0, 0.1
-"""What is likely of a bar's lean before it is measured: none but for a mount's error and the car's springs
-(sigma), and of one camera in ten, whose mount nobody levelled, anything up to the steepest. With more of
-these, sigmas of level bars far away are too large; with fewer, those of leaning ones too small for longer."""
+_LEVEL_TILT_DEG, _MAX_TILT_DEG, _TILTED_SHARE = 0.7, 5.0, 0.1
+"""Prior of a bar's tilt before it is measured: none but for a mount's error and the car's springs (sigma),
+and for one camera in ten, whose mount nobody levelled, anything up to the steepest. With more of these,
+sigmas of level bars far away are too large; with fewer, those of tilted ones too small for longer."""
 
 _TILT_MEMORY_S = 1.0
 """A car's pitch changes within a second when it brakes."""
 
-_STEP_DEG = 0.1
-"""Grid of leans that are weighed: a third of the sigma that the bends of a second have at 30 m."""
+_TILT_STEP_DEG = 0.1
+"""Grid of tilts: a third of the sigma that the curvature of a second has at 30 m."""
 
-_SLANTED_SHARE = 6e-5
-"""Of the bars that a camera with a known attitude sees: not plumb all the same, or the attitude is wrong;
-then anything up to the steepest, more or less. As seldom as an outlier, so that it costs the others no sigma,
-and enough that a bend which contradicts is believed."""
+_NOT_PLUMB_SHARE = 6e-5
+"""Share of the bars that are not plumb, or seen with a wrong attitude: they may have any tilt up to the
+steepest. As rare as an outlier, so that it adds nothing to other sigmas, and enough to accept a curvature
+that contradicts."""
 
-_WAVE_SHARE, _WAVE_REST_PX = 0.6, 0.03
-"""Share of the wave that distances have, and by how much that is off (sigma): rows far off a fit hardly pull
-it. 0.35 were found in recordings of an independent generator, and 0.85 in rendered ones where the wave is
-higher; off by 0.01 to 0.05 px."""
+_BIAS_SHARE, _BIAS_REST_PX = 0.6, 0.03
+"""Share of the pixel-phase bias that distances have, and its error (sigma), px: rows far off a fit hardly
+pull it. 0.35 was found in recordings of an independent generator, and 0.85 in rendered ones with a larger
+bias; its error is 0.01 to 0.05 px."""
 
-_LEAST_WEIGHT = 0.1
-"""Of the heaviest boundary: below, one is not seen."""
+_MIN_WEIGHT = 0.1
+"""Least weight of a boundary, in that of the heaviest."""
 
 Floats = NDArray[np.float64]
 
 
-class Ranges(NamedTuple):
+class RangeState(NamedTuple):
     """What is remembered of a transmitter's distances.
 
     Attributes:
         past: Time (s), distance (m) and variance (m2) of each, oldest first, float64 (n, 3).
-        bend: Sum of the boundaries' weights, of their bends, beyond what the attitude explains, and of what
-            the pixels' wave would make of them, both weighted, float64 (3, n); empty without any.
-        bend_s: When that was, s.
-        told: The attitude gave how the bar leans then.
-        wave: Sums that say how high the pixels' wave is, of `_kernels.add_phase_bias`, float64 (4,).
-        image: How straight the bar's image is.
-        off: How far boundaries lie off, as in `Curvature`, beyond the known lean, in the newest frame, NaN
-            where unseen, float64 (n,).
+        boundary_sums: Sums over the boundaries' weights, and, weighted, their offsets beyond the known tilt
+            and the pattern of the pixel-phase bias, float64 (3, n); empty without any.
+        sums_s: Time of the newest of these, s.
+        tilt_known: The attitude gave the tilt then.
+        bias_sums: Evidence of the pixel-phase bias, see `_kernels.add_phase_bias`, float64 (4,).
+        distortion: Of the bar's image.
+        offset: Of the boundaries, as in `Curvature`, beyond the known tilt, in the newest frame, NaN where
+            unseen, float64 (n,).
     """
 
     past: Floats = np.empty((0, 3))
-    bend: Floats = np.empty((3, 0))
-    bend_s: float = math.nan
-    told: bool = False
-    wave: Floats = np.zeros(4)
-    image: Image = STRAIGHT
-    off: Floats = np.empty(0)
+    boundary_sums: Floats = np.empty((3, 0))
+    sums_s: float = math.nan
+    tilt_known: bool = False
+    bias_sums: Floats = np.zeros(4)
+    distortion: Distortion = UNDISTORTED
+    offset: Floats = np.empty(0)
 
 
-class RangeKeeper:
-    """Brings distances to the middle of their pilot, corrects for the bar's lean, and makes sigmas true.
+class RangeCorrector:
+    """Moves distances to the middle of their pilot, corrects them for the bar's tilt, and calibrates sigmas.
 
-    A distance itself stays that of its frame: the others say three things about it only. A ranging that reads
-    all of a frame measures at the frame's middle; how fast distances change takes that to the pilot's. A bar
-    that leans towards or from the camera looks shorter, or beside the image's middle longer; its boundaries
-    then lie on a parabola, whose bend is far below a frame's noise and adds up over frames. Where the
-    camera's attitude is known, a plumb bar's lean is, too, to its sigma, and the bend tells the rest.
-    And distances of a moving car lie on a smooth line: their scatter about it, against the sigmas that the
-    ranging gave, says what these are worth.
+    A distance remains that of its frame; other frames give three corrections only. A ranging that uses all of
+    a frame measures at the frame's middle: the rate of change takes that to the pilot's. A bar that tilts
+    towards or from the camera looks shorter, or beside the image's middle longer; its boundaries are then on
+    a parabola, whose curvature is far below a frame's noise and adds up over frames. Where the camera's
+    attitude is known, so is the tilt of a plumb bar, to its sigma, and the curvature gives the rest. And
+    distances of a moving car are on a smooth line: their scatter about it scales the sigmas of the ranging.
 
-    A boundary that falls between two pixels seems nearer to one of them than it is. Over boundaries that lie
-    differently this averages out; over those of a bar whose clusters are a whole number of pixels apart it
-    looks like another spacing, or a bend. How far they seem off follows the sine of their place on the
-    pixels, by symmetry; how high that wave is shows in frames whose boundaries lie in many ways on them.
+    A boundary that falls between two pixels seems nearer to one of them than it is. This averages out over
+    boundaries with different phases; over those of a bar whose clusters are a whole number of pixels apart it
+    looks like another spacing, or a curvature. By symmetry, this pixel-phase bias follows the sine of a
+    boundary's place on the pixels; its amplitude shows in frames whose boundaries have many phases.
     """
 
     def __init__(self) -> None:
         # The middles of the grid's cells.
-        self._lean_deg = np.arange(-_LEANING_DEG + _STEP_DEG / 2, _LEANING_DEG, _STEP_DEG)
-        self._sine = np.sin(np.radians(self._lean_deg))
-        self._likely = self._mixture(_LEVEL_DEG, _LEANING_SHARE)
+        self._tilt_deg = np.arange(-_MAX_TILT_DEG + _TILT_STEP_DEG / 2, _MAX_TILT_DEG, _TILT_STEP_DEG)
+        self._sine = np.sin(np.radians(self._tilt_deg))
+        self._prior = self._tilt_prior(_LEVEL_TILT_DEG, _TILTED_SHARE)
 
     def step(
-        self, state: Ranges, t_us: float, chip_us: float, measured: Range, sight: LineOfSight
-    ) -> tuple[Ranges, Range]:
-        """Take a frame's distance; give the new state and the distance as it should be.
+        self, state: RangeState, t_us: float, chip_us: float, measured: Range, line_of_sight: LineOfSight
+    ) -> tuple[RangeState, Range]:
+        """Correct a frame's distance; return the new state and the distance.
 
         Args:
             state: What is remembered; not changed.
             t_us: Start of the frame, us.
             chip_us: Length of a chip, us.
-            measured: As the ranging gave it; without a distance, or a sigma, it is given back.
-            sight: Where the bar is seen, and what the attitude says of its lean.
+            measured: By the ranging; without a distance, or a sigma, it is returned as it is.
+            line_of_sight: Of the bar.
         """
-        distance_m, sigma_m = (
-            measured.distance_m * sight.magnification,
-            measured.sigma_m * sight.magnification,
-        )
+        distance_m = measured.distance_m * line_of_sight.magnification
+        sigma_m = measured.sigma_m * line_of_sight.magnification
         if not (0 < distance_m < math.inf and 0 <= sigma_m < math.inf):
             return state, measured
         t_s, late_s = t_us * 1e-6, measured.late_chips * chip_us * 1e-6
-        bend, bend_s, told, wave, image = state.bend, state.bend_s, state.told, state.wave, STRAIGHT
-        height, unsure_m, off = (0.0, WAVE_PX**2), 0.0, state.off
-        if measured.curvature is not None:
-            faded = math.exp(-max(t_s - bend_s, 0.0) / _TILT_MEMORY_S) if bend.size else 0.0
-            new = _weighed(measured.curvature, (sight.tilt_sine or 0.0) + sight.distortion_tilt)
-            goes_on = bend.shape == new.shape and told == (sight.tilt_sine is not None)
-            bend, bend_s, told = new + faded * bend if goes_on else new, t_s, sight.tilt_sine is not None
-            wave, off, known = wave * faded, np.empty(new.shape[1]), (bend, state.off)
-            scatter = _kernels.add_phase_bias(measured.curvature.place, new, _LEAST_WEIGHT, wave, known, off)
-            sums = wave.tolist()
-            height = _height(sums)
-            distance_m -= _WAVE_SHARE * height[0] * measured.curvature.phase_bias_m
-            # The ranging's sigma is of boundaries with the wave.
-            sigma_m *= math.sqrt(_left_over(sums, height[0]))
-            unsure_m = (
-                math.hypot(_WAVE_SHARE * math.sqrt(height[1]), _WAVE_REST_PX)
-                * measured.curvature.phase_bias_m
+        past, sums, sums_s, tilt_known, bias_sums, distortion, offset = state
+        distortion, bias, bias_sigma_m = UNDISTORTED, (0.0, PHASE_BIAS_PX**2), 0.0
+        curvature = measured.curvature
+        if curvature is not None:
+            faded = math.exp(-max(t_s - sums_s, 0.0) / _TILT_MEMORY_S) if sums.size else 0.0
+            known_tilt = (line_of_sight.tilt_sine or 0.0) + line_of_sight.distortion_tilt
+            new_sums = _weigh_boundaries(curvature, known_tilt)
+            goes_on = sums.shape == new_sums.shape and tilt_known == (line_of_sight.tilt_sine is not None)
+            sums, sums_s = new_sums + faded * sums if goes_on else new_sums, t_s
+            tilt_known = line_of_sight.tilt_sine is not None
+            bias_sums, offset = bias_sums * faded, np.empty(new_sums.shape[1])
+            scatter = _kernels.add_phase_bias(
+                curvature.place, new_sums, _MIN_WEIGHT, bias_sums, (sums, state.offset), offset
             )
-            image = judge_image(measured.curvature, off, bend, scatter, state.image, t_s)
-            distance_m *= 1 - image.longer
-        sigma_m = max(sigma_m, _LEAST_SIGMA * abs(distance_m))
-        old = state.past
-        while len(old) and old[0, 0] <= t_s - _MEMORY_S:
-            old = old[1:]
-        past = np.empty((len(old) + 1, 3))
-        past[:-1], past[-1] = old, (t_s, distance_m, sigma_m**2)
-        # They follow a parabola whose speed and acceleration are likely as above; the squares of what is
-        # left, in those that the sigmas expect, scale the variances.
+            evidence = bias_sums.tolist()
+            bias = _estimate_bias(evidence)
+            distance_m -= _BIAS_SHARE * bias[0] * curvature.phase_bias_m
+            # The ranging's sigma is that of boundaries with the bias.
+            sigma_m *= math.sqrt(_remaining_scatter(evidence, bias[0]))
+            bias_sigma = math.hypot(_BIAS_SHARE * math.sqrt(bias[1]), _BIAS_REST_PX)
+            bias_sigma_m = bias_sigma * curvature.phase_bias_m
+            distortion = assess_distortion(curvature, offset, sums, scatter, state.distortion, t_s)
+            distance_m *= 1 - distortion.stretch
+        sigma_m = max(sigma_m, _MIN_SIGMA_SHARE * abs(distance_m))
+        while len(past) and past[0, 0] <= t_s - _MEMORY_S:
+            past = past[1:]
+        past = np.concatenate([past, [(t_s, distance_m, sigma_m**2)]])
         speed_m_s, speed_variance, variance = _kernels.fit_newest(
-            past, _SPEED_M_S**-2, _ACCELERATION_M_S2**-2, _SCATTER_WORTH, _OUTLIER**2
+            past, _SPEED_M_S**-2, _ACCELERATION_M_S2**-2, _SCATTER_WORTH, _OUTLIER_SIGMAS**2
         )
         distance_m -= speed_m_s * late_s
-        # What is not known of the wave is alike in many frames: their scatter does not show it.
-        variance += speed_variance * late_s**2 + unsure_m**2
-        # Nor does it show what bends the image.
-        standing_m = distance_m * image.sigma
+        # The scatter of frames does not show errors that many frames have alike: of the bias, and of what
+        # distorts the image.
+        standing_m = distance_m * distortion.sigma
+        variance += speed_variance * late_s**2 + bias_sigma_m**2
         variance += standing_m**2
-        # A bend that no lean makes says nothing of one.
-        newest = None if image.whole else measured.curvature
-        length, length_variance = self._leaning(bend, height, newest, sight)
+        # The curvature of a smoothly distorted image is not the tilt's.
+        place = None if distortion.is_smooth or curvature is None else curvature.place
+        length, length_variance = self._foreshortening(sums, bias, place, line_of_sight)
         variance = variance * length**2 + distance_m**2 * length_variance
-        found = Range(
+        corrected = Range(
             distance_m * length,
             math.sqrt(variance),
             measured.pairs,
             standing_m=standing_m * length,
-            distortion_px=image.bent_px,
+            distortion_px=distortion.residuals_px,
         )
-        return Ranges(past, bend, bend_s, told, wave, image, off), found
+        return RangeState(past, sums, sums_s, tilt_known, bias_sums, distortion, offset), corrected
 
-    def _leaning(
-        self, sums: Floats, wave: tuple[float, float], newest: Curvature | None, sight: LineOfSight
+    def _foreshortening(
+        self, sums: Floats, bias: tuple[float, float], place: Floats | None, line_of_sight: LineOfSight
     ) -> tuple[float, float]:
-        """Mean and variance of the foreshortening, by what is likely and by what was seen."""
-        likely, sine, told = self._likely, self._sine, 0.0
-        if sight.tilt_sine is not None:
-            told = sight.tilt_sine
-            sine = np.sin(math.asin(told) + np.radians(self._lean_deg))
-            sigma_deg = math.degrees(sight.tilt_sigma / math.sqrt(max(1 - told**2, sight.tilt_sigma**2)))
-            likely = self._mixture(sigma_deg, _SLANTED_SHARE)
-        off, sigma = math.nan, 1.0
-        if newest is not None:
-            # What puts the boundaries of every frame off alike is in their scatter about a parabola, too.
-            off, variance = _kernels.estimate_curvature(newest.place, sums, _LEAST_WEIGHT, *wave)
-            sigma = 1.0 if math.isnan(off) else math.sqrt(max(variance, 1e-12))
-        return _kernels.estimate_foreshortening(sine, likely, told + off, sigma, sight.along, sight.across)
+        """Mean and variance of the foreshortening, by the prior of the tilt and the boundaries at `place`."""
+        prior, sine, known_sine = self._prior, self._sine, 0.0
+        if line_of_sight.tilt_sine is not None:
+            known_sine, sigma = line_of_sight.tilt_sine, line_of_sight.tilt_sigma
+            sine = np.sin(math.asin(known_sine) + np.radians(self._tilt_deg))
+            sigma_deg = math.degrees(sigma / math.sqrt(max(1 - known_sine**2, sigma**2)))
+            prior = self._tilt_prior(sigma_deg, _NOT_PLUMB_SHARE)
+        tilt_sine, sigma = math.nan, 1.0
+        if place is not None:
+            # Offsets that are alike in all frames are in the scatter about a parabola, too.
+            tilt_sine, variance = _kernels.estimate_curvature(place, sums, _MIN_WEIGHT, *bias)
+            sigma = 1.0 if math.isnan(tilt_sine) else math.sqrt(max(variance, 1e-12))
+        return _kernels.estimate_foreshortening(
+            sine, prior, known_sine + tilt_sine, sigma, line_of_sight.along, line_of_sight.across
+        )
 
-    def _mixture(self, sigma_deg: float, share: float) -> Floats:
-        """Chances of the leans of the grid: as surely as said, but for a share of which nothing is known."""
-        # Half a step is as narrow as a grid shows it.
-        sigma_deg = max(sigma_deg, _STEP_DEG / 2)
-        bell = np.exp(-0.5 * np.minimum((self._lean_deg / sigma_deg) ** 2, 1400.0)) / sigma_deg
-        return np.asarray((1 - share) * (bell / math.sqrt(2 * math.pi)) + share / (2 * _LEANING_DEG))
+    def _tilt_prior(self, sigma_deg: float, share: float) -> Floats:
+        """Probabilities of the grid's tilts: normal, but for a share of bars with any tilt."""
+        # Half a step is the narrowest that the grid resolves.
+        sigma_deg = max(sigma_deg, _TILT_STEP_DEG / 2)
+        bell = np.exp(-0.5 * np.minimum((self._tilt_deg / sigma_deg) ** 2, 1400.0)) / sigma_deg
+        return np.asarray((1 - share) * (bell / math.sqrt(2 * math.pi)) + share / (2 * _MAX_TILT_DEG))
 
 
-def _weighed(curvature: Curvature, sine: float) -> Floats:
-    """Weights of a frame's boundaries, and what lies off and the wave by these, without the known lean."""
-    off = curvature.offset - sine * curvature.place**2 if sine else curvature.offset
-    sums = np.empty((3, len(off)))
-    sums[0], sums[1] = curvature.weight, curvature.weight * off
+def _weigh_boundaries(curvature: Curvature, tilt_sine: float) -> Floats:
+    """Sums of a frame's boundaries, as in `RangeState`, beyond a known tilt."""
+    offset = curvature.offset - tilt_sine * curvature.place**2 if tilt_sine else curvature.offset
+    sums = np.empty((3, len(offset)))
+    sums[0], sums[1] = curvature.weight, curvature.weight * offset
     sums[2] = 0.0 if curvature.phase_bias is None else curvature.weight * curvature.phase_bias
     return sums
 
 
-def _height(wave: list[float]) -> tuple[float, float]:
-    """How high the pixels' wave is, px, and the variance of that, by what frames show and what is likely."""
-    squares, products, left, freedom = wave
+def _estimate_bias(bias_sums: list[float]) -> tuple[float, float]:
+    """Amplitude of the pixel-phase bias, px, and its variance, by the evidence of frames and its prior."""
+    squares, products, residuals, freedom = bias_sums
     if not (squares > 0 and freedom > 1):
-        return 0.0, WAVE_PX**2
-    noise = ALIKE * max(left - products**2 / squares, 1e-12 * squares) / (freedom - 1)
-    variance = 1 / (squares / noise + WAVE_PX**-2)
+        return 0.0, PHASE_BIAS_PX**2
+    noise = CORRELATED_FRAMES * max(residuals - products**2 / squares, 1e-12 * squares) / (freedom - 1)
+    variance = 1 / (squares / noise + PHASE_BIAS_PX**-2)
     return products / noise * variance, variance
 
 
-def _left_over(wave: list[float], height_px: float) -> float:
-    """Share of the boundaries' scatter that is left when a wave of that height is taken out."""
-    squares, products, left, _ = wave
-    if not left > 0:
+def _remaining_scatter(bias_sums: list[float], bias_px: float) -> float:
+    """Share of the boundaries' squared residuals that remains without a bias of this amplitude."""
+    squares, products, residuals, _ = bias_sums
+    if not residuals > 0:
         return 1.0
-    return min(max(1 - height_px * (2 * products - height_px * squares) / left, 0.0), 1.0)
+    return min(max(1 - bias_px * (2 * products - bias_px * squares) / residuals, 0.0), 1.0)

@@ -17,7 +17,7 @@ from evlcp_sdk.rx.framer import Announcer
 from evlcp_sdk.rx.guard import Guard, compiled, tracker_of
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
-from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
+from evlcp_sdk.rx.ranges import RangeCorrector, RangeState
 from evlcp_sdk.rx.regions import MARGIN_PX, BarPlace, TrackedRegion
 from evlcp_sdk.rx.spread import LateSpread, Spread, neighbours
 from evlcp_sdk.scene.attitude import Attitude
@@ -67,7 +67,7 @@ class Steps:
 
     def __init__(self, link: Link, announcer: Announcer | None, tracker: Tracker) -> None:
         self._codebook = link.codebook
-        self._keeper = RangeKeeper()
+        self._corrector = RangeCorrector()
         self._announcer = announcer
         self._guards = {role: Guard(link, role) for role in ("separation", "decoding", "ranging")}
         book = link.codebook
@@ -76,9 +76,9 @@ class Steps:
         self._measure = compiled(link, "ranging", link.camera, link.bar, book)
         self._distance = tracker.distance
 
-    def init_distance(self) -> tuple[Ranges, Any]:
+    def init_distance(self) -> tuple[RangeState, Any]:
         """State of a transmitter's distance before its first frame."""
-        return Ranges(), None if self._distance is None else self._distance.init()
+        return RangeState(), None if self._distance is None else self._distance.init()
 
     def separate(self, sums: NDArray[np.int16]) -> PresenceMap:
         """Find the clusters in a pilot's polarity sums, int16 (chips, height, width)."""
@@ -128,17 +128,17 @@ class Steps:
 
     def track_distance(
         self,
-        state: tuple[Ranges, Any],
+        state: tuple[RangeState, Any],
         t_us: float,
         chip_us: float,
         measured: Range,
         line_of_sight: LineOfSight,
-    ) -> tuple[tuple[Ranges, Any], Range, Range | None]:
+    ) -> tuple[tuple[RangeState, Any], Range, Range | None]:
         """Correct and filter a frame's distance; return the new state, the distance, and the filtered one.
 
         The filtered distance is the prediction where a frame allows none, and None without tracking.
         """
-        ranges, distance = self._keeper.step(state[0], t_us, chip_us, measured, line_of_sight)
+        ranges, distance = self._corrector.step(state[0], t_us, chip_us, measured, line_of_sight)
         filter_state, filtered = self._filter_distance(state[1], t_us, distance)
         return (ranges, filter_state), distance, filtered
 
@@ -198,7 +198,7 @@ class BarState(NamedTuple):
     pilot: Pilot | None
     frame: int
     symbols: NDArray[np.int64]
-    distance: tuple[Ranges, Any]
+    distance: tuple[RangeState, Any]
 
 
 class FrameResult(NamedTuple):

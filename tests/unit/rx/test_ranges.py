@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
-from evlcp_sdk.rx.straight import straighten
+from evlcp_sdk.rx.distortion import fit_straight
+from evlcp_sdk.rx.ranges import RangeCorrector, RangeState
 from evlcp_sdk.scene.tilt import LineOfSight
 from evlcp_sdk.values import Curvature, Range
 
@@ -20,9 +20,9 @@ FOCAL_PX = 7200.0
 AHEAD = LineOfSight()
 
 
-def bend_of(lean_deg, distance_m, noise_px, rng):
-    """Boundaries of a leaning bar, where a pinhole sees them: by perspective, not by a parabola."""
-    sine, cosine = math.sin(math.radians(lean_deg)), math.cos(math.radians(lean_deg))
+def boundaries(tilt_deg, distance_m, noise_px, rng):
+    """Boundaries of a tilted bar, where a pinhole sees them: by perspective, not by a parabola."""
+    sine, cosine = math.sin(math.radians(tilt_deg)), math.cos(math.radians(tilt_deg))
     along = PLACES * SPACING_M
     seen_px = FOCAL_PX * along * cosine / (distance_m - along * sine)
     spacing_px = FOCAL_PX * SPACING_M * cosine / distance_m
@@ -31,15 +31,15 @@ def bend_of(lean_deg, distance_m, noise_px, rng):
     return Curvature(PLACES, off_px / one_px, np.full(len(PLACES), one_px**2))
 
 
-def drive(frames, sigma_m, bend_px, seed, *, said_m=None, start_m=50.0, speed_m_s=-10.0, **how):
-    """Errors and sigmas, float64 (frames, 2), of a drive whose distances err by `sigma_m`, said `said_m`."""
-    rng, late_chips, lean_deg = np.random.default_rng(seed), 8.0, how.get("lean_deg", 0.0)
+def drive(frames, sigma_m, noise_px, seed, *, given_m=None, start_m=50.0, speed_m_s=-10.0, **how):
+    """Errors and sigmas, float64 (frames, 2), of a drive whose distances err by `sigma_m`, as given."""
+    rng, late_chips, tilt_deg = np.random.default_rng(seed), 8.0, how.get("tilt_deg", 0.0)
     true_m = start_m + speed_m_s * FRAME_US * 1e-6 * np.arange(frames)
     late_m = true_m + speed_m_s * late_chips * CHIP_US * 1e-6
-    seen_m = late_m / math.cos(math.radians(lean_deg)) + sigma_m * rng.standard_normal(frames)
-    bends = [bend_of(lean_deg, m, bend_px, rng) for m in true_m.tolist()]
+    seen_m = late_m / math.cos(math.radians(tilt_deg)) + sigma_m * rng.standard_normal(frames)
+    bends = [boundaries(tilt_deg, m, noise_px, rng) for m in true_m.tolist()]
     given = zip(seen_m.tolist(), bends, strict=True)
-    measured = (Range(m, said_m or sigma_m, 15, late_chips, bend) for m, bend in given)
+    measured = (Range(m, given_m or sigma_m, 15, late_chips, bend) for m, bend in given)
     _, found = remembered_lengths(measured, how.get("sight", AHEAD))
     assert {one.pairs for one in found} == {15}
     return np.stack([[one.distance_m for one in found] - true_m, [one.sigma_m for one in found]], axis=1)
@@ -47,9 +47,9 @@ def drive(frames, sigma_m, bend_px, seed, *, said_m=None, start_m=50.0, speed_m_
 
 def remembered_lengths(measured, sight=AHEAD):
     """What is remembered after frames with these distances, and the distances as they should be."""
-    keeper, state, out = RangeKeeper(), Ranges(), []
+    corrector, state, out = RangeCorrector(), RangeState(), []
     for i, one in enumerate(measured):
-        state, found = keeper.step(state, i * FRAME_US, CHIP_US, one, sight)
+        state, found = corrector.step(state, i * FRAME_US, CHIP_US, one, sight)
         out.append(found)
     return state, out
 
@@ -59,13 +59,13 @@ def nees(errors):
 
 
 def test_without_a_distance_nothing_changes():
-    keeper, state = RangeKeeper(), Ranges()
+    corrector, state = RangeCorrector(), RangeState()
     for measured in (Range(math.nan, math.nan, 0), Range(50.0, math.nan, 3), Range(0.0, 0.0, 3)):
-        assert keeper.step(state, 0.0, CHIP_US, measured, AHEAD) == (state, measured)
+        assert corrector.step(state, 0.0, CHIP_US, measured, AHEAD) == (state, measured)
 
 
 def foreshortening(along=0.0, about_deg=0.0, sigma_deg=0.7, share=0.1):
-    """Mean and standard deviation of the foreshortening over what is likely of a lean, by quadrature."""
+    """Mean and standard deviation of the foreshortening over what is likely of a tilt, by quadrature."""
     sigma, most, about = math.radians(sigma_deg), math.radians(5), math.radians(about_deg)
 
     def mean_of(value):
@@ -79,14 +79,14 @@ def foreshortening(along=0.0, about_deg=0.0, sigma_deg=0.7, share=0.1):
     return mean, math.sqrt(mean_of(lambda length: (length - mean) ** 2))
 
 
-@pytest.mark.parametrize("lean_deg", [None, -4.0, 0.0, 12.0])
+@pytest.mark.parametrize("tilt_deg", [None, -4.0, 0.0, 12.0])
 @pytest.mark.parametrize("along", [0.0, 0.05, -0.05])
-def test_a_first_distance_stays_but_for_the_tilt_that_is_known_or_likely(along, lean_deg):
-    """A bar 360 px off the middle looks shorter or longer by a twentieth of its lean."""
+def test_a_first_distance_stays_but_for_the_tilt_that_is_known_or_likely(along, tilt_deg):
+    """A bar 360 px off the middle looks shorter or longer by a twentieth of its tilt."""
     sight, likely = LineOfSight(along), ()
-    if lean_deg is not None:
-        sight = LineOfSight(along, tilt_sine=math.sin(math.radians(lean_deg)), tilt_sigma=math.radians(0.3))
-        likely = lean_deg, 0.3, 6e-5
+    if tilt_deg is not None:
+        sight = LineOfSight(along, tilt_sine=math.sin(math.radians(tilt_deg)), tilt_sigma=math.radians(0.3))
+        likely = tilt_deg, 0.3, 6e-5
     _, (found,) = remembered_lengths([Range(50.0, 0.02, 15)], sight)
     mean, spread = foreshortening(along, *likely)
     assert found.distance_m == pytest.approx(50 * mean, abs=1e-3 if likely else 2e-4)
@@ -105,37 +105,37 @@ def test_distances_are_brought_to_the_pilot():
 @pytest.mark.parametrize("truth", [0.6, 1.0, 3.0])
 def test_sigmas_become_true(truth):
     """Errors of three times the sigma that the ranging says, or of little more than half."""
-    errors = np.concatenate([drive(90, 0.05 * truth, 0.01, seed, said_m=0.05)[20:] for seed in range(12)])
+    errors = np.concatenate([drive(90, 0.05 * truth, 0.01, seed, given_m=0.05)[20:] for seed in range(12)])
     # 840 errors; the sigmas of a drive are known from its frames alone.
     assert 0.75 < nees(errors) < 1.35
 
 
 @pytest.mark.parametrize(
-    ("lean_deg", "told_deg"), [(-5.0, None), (-3.0, None), (0.0, None), (4.0, None), (6.0, 4.0)]
+    ("tilt_deg", "known_deg"), [(-5.0, None), (-3.0, None), (0.0, None), (4.0, None), (6.0, 4.0)]
 )
-def test_a_tilt_is_found_in_the_curvature(lean_deg, told_deg):
-    """Also by how much it differs from what an attitude tells, to 2 degrees."""
+def test_a_tilt_is_found_in_the_curvature(tilt_deg, known_deg):
+    """Also by how much it differs from what an attitude gives, to 2 degrees."""
     sight = AHEAD
-    if told_deg is not None:
-        sight = LineOfSight(tilt_sine=math.sin(math.radians(told_deg)), tilt_sigma=math.radians(2))
-    how = {"start_m": 42.0, "lean_deg": lean_deg, "sight": sight}
+    if known_deg is not None:
+        sight = LineOfSight(tilt_sine=math.sin(math.radians(known_deg)), tilt_sigma=math.radians(2))
+    how = {"start_m": 42.0, "tilt_deg": tilt_deg, "sight": sight}
     errors = np.stack([drive(60, 0.015, 0.04, seed, **how) for seed in range(8)])
-    # A frame tells a lean to 2.5 degrees here: the first ten cannot tell a lean from none.
+    # A frame shows a tilt to 2.5 degrees here: the first ten cannot tell a tilt from none.
     assert 0.5 < nees(errors[:, 10:].reshape(-1, 2)) < 2
-    # What is left of 1 - cos(lean), up to 0.16 m.
+    # What is left of 1 - cos(tilt), up to 0.16 m.
     assert abs(errors[:, -1, 0].mean()) < 0.02
 
 
 def test_a_distance_keeps_nothing_of_old_curvatures_and_distances():
     rng = np.random.default_rng(5)
-    measured = [Range(45.1, 0.01, 15, 8.0, bend_of(4.0, 45.0, 0.04, rng)) for _ in range(400)]
+    measured = [Range(45.1, 0.01, 15, 8.0, boundaries(4.0, 45.0, 0.04, rng)) for _ in range(400)]
     state, _ = remembered_lengths(measured)
     weight = measured[-1].curvature.weight
     assert len(state.past) <= 0.3 / (FRAME_US * 1e-6) + 1
-    assert state.bend[0].max() < 1.01 * weight.max() / (1 - math.exp(-FRAME_US * 1e-6))
-    new, _ = RangeKeeper().step(state, 400 * FRAME_US + 20e6, CHIP_US, measured[-1], AHEAD)
+    assert state.boundary_sums[0].max() < 1.01 * weight.max() / (1 - math.exp(-FRAME_US * 1e-6))
+    new, _ = RangeCorrector().step(state, 400 * FRAME_US + 20e6, CHIP_US, measured[-1], AHEAD)
     assert len(new.past) == 1
-    assert new.bend[0] == pytest.approx(weight)
+    assert new.boundary_sums[0] == pytest.approx(weight)
 
 
 def frame_of(seem_px, true_m, sigma_m, **more):
@@ -146,40 +146,40 @@ def frame_of(seem_px, true_m, sigma_m, **more):
     return Range(FOCAL_PX * SPACING_M / slope, sigma_m, 15, 8.0, bend)
 
 
-def waves(spacings_px, height_px, rng):
+def biased(spacings_px, height_px, rng):
     """Error and sigma of the last of some distances, and what it was before.
 
-    Of frames of a level bar whose boundaries seem off by a wave of the pixels.
+    Of frames of a level bar whose boundaries have a pixel-phase bias.
     """
     start, frames = rng.uniform(), []
     for spacing_px in spacings_px.tolist():
         true_m = FOCAL_PX * SPACING_M / spacing_px
-        wave = np.sin(2 * np.pi * (start + spacing_px * PLACES))
-        seem_px = spacing_px * PLACES + height_px * wave + 0.02 * rng.standard_normal(15)
-        wave_m = -true_m * np.polyfit(PLACES, wave, 1)[0] / spacing_px
-        wave /= spacing_px * SPACING_M / true_m
+        bias = np.sin(2 * np.pi * (start + spacing_px * PLACES))
+        seem_px = spacing_px * PLACES + height_px * bias + 0.02 * rng.standard_normal(15)
+        bias_m = -true_m * np.polyfit(PLACES, bias, 1)[0] / spacing_px
+        bias /= spacing_px * SPACING_M / true_m
         frames.append(
-            frame_of(seem_px, true_m, 0.02 / 16.7 / spacing_px * true_m, phase_bias=wave, phase_bias_m=wave_m)
+            frame_of(seem_px, true_m, 0.02 / 16.7 / spacing_px * true_m, phase_bias=bias, phase_bias_m=bias_m)
         )
     found = remembered_lengths(frames)[1][-1]
     return found.distance_m - true_m, found.sigma_m, frames[-1].distance_m - true_m, frames[-1].sigma_m
 
 
-def test_a_pixel_phase_bias_is_estimated_and_taken_out():
-    """At a spacing of 8 px and a fifteenth a wave looks like a lean, and the same in every frame."""
+def test_a_pixel_phase_bias_is_estimated_and_removed():
+    """At a spacing of 8 px and a fifteenth a bias looks like a tilt, and the same in every frame."""
     # Farther away boundaries lie in many ways on the pixels; then the car stands.
     spacings_px = np.minimum(7.6 + 0.02 * np.arange(60), 8 + 1 / 15)
     rng = np.random.default_rng(9)
-    error, sigma, raw, _ = np.array([waves(spacings_px, 0.1, rng) for _ in range(20)]).T
+    error, sigma, raw, _ = np.array([biased(spacings_px, 0.1, rng) for _ in range(20)]).T
     assert np.sqrt((raw**2).mean()) > 0.05
     assert np.sqrt((error**2).mean()) < 0.6 * np.sqrt((raw**2).mean())
     assert np.mean((error / sigma) ** 2) < 1.5
 
 
-def test_what_is_not_known_of_the_pixel_phase_bias_is_in_the_sigma():
+def test_what_is_not_known_of_the_bias_is_in_the_sigma():
     """A camera that stands: all frames err alike, and their scatter says nothing of it."""
     rng, still_px = np.random.default_rng(10), np.full(60, 8 + 1 / 15)
-    found = [waves(still_px, height_px, rng) for height_px in rng.normal(0, 0.07, 40)]
+    found = [biased(still_px, height_px, rng) for height_px in rng.normal(0, 0.07, 40)]
     error, sigma, raw, raw_sigma = np.array(found).T
     assert np.mean((error / sigma) ** 2) < 2
     # A ranging alone says less than a third of it.
@@ -203,7 +203,7 @@ def test_what_bends_an_image_does_not_average_away(height_px):
     raw = np.array([one.distance_m - 45 for one in measured])
     _, found = remembered_lengths(measured)
     error = np.array([one.distance_m - 45 for one in found])
-    # No lean is seen in it, and the bend is not taken for more than it is.
+    # No tilt is seen in it, and the curvature is not taken for more than it is.
     assert np.abs(error)[-20:].max() < np.abs(raw)[-20:].max() + 0.02
     for one in found[-20:]:
         assert one.standing_m > 0.4 * abs(raw.mean())
@@ -261,8 +261,8 @@ def scale_errors(error_px, rng):
     """What a scale through boundaries with such errors is too short by, px, and what they say of it."""
     off = error_px + NOISE_PX * rng.standard_normal(15)
     slope, mean = np.polyfit(PLACES, off, 1)
-    # A lean's parabola, as large as it may be, is none of theirs.
-    return -slope, straighten(PLACES, off - slope * PLACES - mean + 0.01 * (PLACES**2 - 56 / 3), 0.1, 0.01)
+    # A tilt's parabola, as large as it may be, is none of theirs.
+    return -slope, fit_straight(PLACES, off - slope * PLACES - mean + 0.01 * (PLACES**2 - 56 / 3), 0.1, 0.01)
 
 
 def error_statistics(errors_of, rng):
@@ -273,7 +273,7 @@ def error_statistics(errors_of, rng):
     return np.array([(px, px - one.slope, (px - one.slope) ** 2 / one.variance) for px, one in found]).T
 
 
-def test_dark_leds_are_distinguished_from_a_straight_bar():
+def test_dark_leds_are_separated_from_a_straight_bar():
     """Most boundaries agree: the error is a third of that of a scale through all, and its sigma is true."""
     rng = np.random.default_rng(2)
     before, after, squares = error_statistics(dark, rng)
