@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import unquote
 
-from evlcp_sdk.errors import EvlcpError, InputError, StreamError
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
 from evlcp_sdk.files import Outputs, path_exists
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
@@ -205,9 +205,9 @@ def open_writer(
         registry: The plugins to ask for other formats; None for all that are installed.
 
     Raises:
-        ConfigError: A package that a bag needs is not installed.
+        ConfigError: The format is unknown, width and height are missing for RAW or a bag, or a package that a
+            bag needs is not installed.
         OutputError: The file cannot be written.
-        StreamError: The format is unknown, or width and height are missing for RAW or a bag.
     """
     suffix = _suffix(Path(path))
     name = (format or WRITABLE.get(suffix, "")).upper()
@@ -222,12 +222,12 @@ def open_writer(
         if writer is not None:
             return writer
         found = f"format {format!r}" if format else f"suffix {suffix!r}"
-        raise StreamError(
+        raise ConfigError(
             f"{path}: {found}, expected {', '.join(WRITABLE)} or format EVT2, EVT3, NPZ, CSV, or one that a"
             " plugin writes, as .mcap"
         )
     if width is None or height is None:
-        raise StreamError(
+        raise ConfigError(
             f"{path}: the size of the sensor is not known, expected a width and a height for {name}, as"
             " `--size 1280x720` gives them"
         )
@@ -245,8 +245,9 @@ def write_events(
     """Save events and triggers, sorted by time, as a recording; arguments as of `open_writer`.
 
     Raises:
+        ConfigError: The format is unknown.
         OutputError: The file cannot be written.
-        StreamError: The format is unknown or has no place for a value or for triggers, or times run backward.
+        StreamError: The format has no place for a value or for triggers, or times run backward.
     """
     with open_writer(path, width, height, format) as writer:
         writer.write(events, triggers)

@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from evlcp_sdk.errors import InputError, RawFormatError, StreamError
+from evlcp_sdk.errors import ConfigError, InputError, RawFormatError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.io import _kernels
 from evlcp_sdk.io.evt import EVT2, EVT3, MAX_SIDE, Codec, Decoder, EventBuffer
@@ -389,7 +389,7 @@ class RawWriter(EventWriter):
 
     Raises:
         OutputError: The file cannot be written.
-        StreamError: The sensor is larger than the words can address.
+        ConfigError: The sensor is larger than the words can address.
     """
 
     # Words do not state how often the clock has rolled over. Before a first time beyond its range (EVT3: 16.8
@@ -400,7 +400,7 @@ class RawWriter(EventWriter):
         self, path: Path | str, width: int, height: int, codec: Codec = EVT3, outputs: Outputs | None = None
     ) -> None:
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-            raise StreamError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
+            raise ConfigError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
         super().__init__(path, width, height, outputs)
         self.channels = codec.channels
         self._encoder = RawEncoder(codec)

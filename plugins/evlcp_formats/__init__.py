@@ -5,7 +5,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evlcp_sdk.errors import InputError, StreamError
+from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import path_exists
 from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
 
@@ -85,7 +85,7 @@ def evlcp_open_writer(
     if (format or path.suffix).upper() not in ("BAG", ".MCAP"):
         return None
     if width is None or height is None:
-        raise StreamError(f"{path}: sensor of {width}x{height}, expected a width and a height for BAG")
+        raise ConfigError(f"{path}: sensor of {width}x{height}, expected a width and a height for BAG")
     from evlcp_formats.ros import EventBagWriter
 
     return EventBagWriter(path, width, height, outputs)

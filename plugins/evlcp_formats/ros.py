@@ -5,7 +5,7 @@ from typing import IO, Any, Final
 
 import numpy as np
 
-from evlcp_sdk.errors import ConfigError, StreamError, import_extra
+from evlcp_sdk.errors import ConfigError, import_extra
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.io.evt import EVT3, MAX_SIDE
 from evlcp_sdk.io.raw import RawEncoder, RawWriter
@@ -75,9 +75,8 @@ class EventBagWriter(EventWriter):
     Messages are stamped by the camera's clock. What is read back is what was written.
 
     Raises:
-        ConfigError: `mcap` or `rosbags` is not installed.
+        ConfigError: `mcap` or `rosbags` is not installed, or the sensor is larger than the words can address.
         OutputError: The file cannot be written.
-        StreamError: The sensor is larger than the words can address.
     """
 
     times_us = RawWriter.times_us
@@ -86,7 +85,7 @@ class EventBagWriter(EventWriter):
 
     def __init__(self, path: Path | str, width: int, height: int, outputs: Outputs | None = None) -> None:
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-            raise StreamError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
+            raise ConfigError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
         super().__init__(path, width, height, outputs)
         self._encoder = RawEncoder(EVT3)
         self._seq = 0

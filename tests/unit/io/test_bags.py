@@ -191,9 +191,9 @@ def test_a_command_that_converts_says_what_is_wrong(tmp_path, evlcp):
     for arguments, code, wanted in (
         ([raw, "-o", npz], 0, f"{npz}: 1,200 events, 0 triggers\n"),
         ([npz, "-o", raw], 0, f"{raw}: 1,200 events, 0 triggers\n"),
-        ([raw, "-o", tmp_path / "a.txt"], 1, "suffix '.txt', expected .raw, .npz, .csv"),
+        ([raw, "-o", tmp_path / "a.txt"], 2, "suffix '.txt', expected .raw, .npz, .csv"),
         ([npz, "-o", raw, "--size", "9"], 2, "'9': expected WIDTHxHEIGHT"),
-        ([cut, "-o", raw], 1, "expected a width and a height for EVT3"),
+        ([cut, "-o", raw], 2, "expected a width and a height for EVT3"),
         ([tmp_path / "none.raw", "-o", raw], 3, "none.raw: No such file"),
         ([cut, "--size", "1280x720", "-o", tmp_path / "cut.raw"], 3, "line 3"),
     ):

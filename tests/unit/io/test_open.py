@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evlcp_sdk.errors import InputError, PluginWarning, StreamError
+from evlcp_sdk.errors import ConfigError, InputError, PluginWarning
 from evlcp_sdk.io import EventSource, open_source, open_writer, read_events, write_events
 from evlcp_sdk.io.open import is_recording
 from evlcp_sdk.plugin.hooks import hookimpl
@@ -133,6 +133,6 @@ def test_a_writer_that_cannot_be_used_is_named(tmp_path, suffix, reason):
     registry = Registry.load(Camera())
     with (
         pytest.warns(PluginWarning, match=re.escape(reason)),
-        pytest.raises(StreamError, match=f"suffix '.{suffix}', expected"),
+        pytest.raises(ConfigError, match=f"suffix '.{suffix}', expected"),
     ):
         open_writer(tmp_path / f"a.{suffix}", 8, 8, registry=registry)
