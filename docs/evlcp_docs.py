@@ -106,7 +106,7 @@ def _parameters(role: str) -> str:
     """The parameters of a role's built-in algorithms."""
     registry = Registry.load()
     rows = ["| algorithm | parameter | default | meaning |", "|---|---|---|---|"]
-    for entry in registry.installed(role):
+    for entry in registry.list_algorithms(role):
         if entry.distribution == "evlcp-sdk":
             cls = registry.load_class(role, entry.algorithm.id)
             meanings = _descriptions(cls)

@@ -28,7 +28,7 @@ from evlcp_sdk.io.describe import check_sensor, summarize_source
 from evlcp_sdk.io.interruptible import open_until_stopped, stream_until_stopped
 from evlcp_sdk.io.open import STDIN, is_recording
 from evlcp_sdk.link.resolve import Link, load_link
-from evlcp_sdk.link.several import load_links, named_links, placing_links
+from evlcp_sdk.link.several import load_links, name_links, select_positioning_links
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.columns import frames_table
 from evlcp_sdk.results.summary import RunEnd, Status
@@ -557,7 +557,7 @@ def film(
             "a film needs a file: it reads the recording twice, and standard input gives it once"
         )
     registry = Registry.load() if registry is None else registry
-    links = named_links(load_links(link, registry=registry))
+    links = name_links(load_links(link, registry=registry))
     camera = next(iter(links.values())).camera
     with open_source(recording, registry) as source:
         check_sensor(source, recording, camera)
@@ -681,7 +681,7 @@ def _seen_at(
     from evlcp_sdk.place.points import points_at
 
     poses = [pose for pose in poses if pose.recording in ("", Path(url).name)]
-    placing = placing_links(links)
+    placing = select_positioning_links(links)
     periods = {name: one.packet.packet_chips * one.packet.chip_us for name, one in placing.items()}
     frames: dict[int, list[Frame]] = {}
     link_of: dict[int, str] = {}
@@ -747,8 +747,8 @@ def survey(
     from evlcp_sdk.scene.sites import LocalAxes
 
     registry = Registry.load() if registry is None else registry
-    links = named_links(load_links(link, registry=registry))
-    placing = placing_links(links)
+    links = name_links(load_links(link, registry=registry))
+    placing = select_positioning_links(links)
     _check_lines(placing)
     _check_names(recordings, poses, name)
     listed = {site.transmitter_id for site in known}
@@ -804,7 +804,7 @@ def survey_on_the_way(
     """
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
-    plan.check_links(list(named_links(links)))
+    plan.check_links(list(name_links(links)))
     poses: list[KnownPose] = []
     known = {site.transmitter_id: site for site in plan.sites}
     seen = []
@@ -834,7 +834,7 @@ def _own_poses(
     from evlcp_sdk.place.survey import OwnPoses
     from evlcp_sdk.scene.attitude import attitude_source
 
-    navigator = Navigator(placing_links(named_links(links)), plan, attitude)
+    navigator = Navigator(select_positioning_links(name_links(links)), plan, attitude)
     own = OwnPoses(navigator, attitude_source(attitude), Path(url).name)
     taken: dict[int, BarSite] = {}
     with receive(url, links, registry=registry, attitude=attitude) as packets:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs, read_json, writing
-from evlcp_sdk.link.compose import messages_of, packets_of
+from evlcp_sdk.link.compose import encode_messages, make_messages
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.text import to_toml
 from evlcp_sdk.plugin.hooks import hookimpl
@@ -162,8 +162,8 @@ def loop(
             f" {nearest_m:.1f} m on"
         )
     coder = link.block_coder()
-    (message,) = messages_of(link, text=text, transmitter_id=_TRANSMITTER_ID, sequence=seed & 0xFFFFFFFF)
-    symbols = packets_of([message], coder)
+    (message,) = make_messages(link, text=text, transmitter_id=_TRANSMITTER_ID, sequence=seed & 0xFFFFFFFF)
+    symbols = encode_messages([message], coder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     yield _message_step(text, message, symbols, link, folder)

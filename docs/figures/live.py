@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from evlcp_sdk.link.several import load_links, named_links
+from evlcp_sdk.link.several import load_links, name_links
 from evlcp_sdk.live import Budget, Publisher
 from evlcp_sdk.live.services import Serving, serve
 from evlcp_sdk.place.navigator import PositionPlan
@@ -42,7 +42,7 @@ def main() -> None:
     over = threading.Event()
     with (
         TemporaryDirectory() as folder,
-        serve(serving, publisher, named_links(links), name=given.recording.name, sites=sites) as services,
+        serve(serving, publisher, name_links(links), name=given.recording.name, sites=sites) as services,
         Browser(Path(folder)) as browser,
     ):
         # Or else it tells of every picture that the page gets.

@@ -1,4 +1,4 @@
-"""Beacons: where a transmitter is and how its bar hangs."""
+"""Beacons: a transmitter's position, attitude and length."""
 
 import struct
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ _TURN = 360 * _CENTI
 
 @dataclass(frozen=True)
 class Beacon:
-    """A transmitter's place, attitude and length; what the payload of a beacon says.
+    """A transmitter's position, attitude and length: the payload of a beacon.
 
     Attributes:
         latitude_deg: WGS-84 latitude of the bar's centre, to 1e-9 degrees (0.1 mm).
         longitude_deg: Its longitude, likewise.
         height_m: Its height above the ellipsoid, to a millimetre.
-        heading_deg: Where its top leans to, clockwise from north, to a hundredth of a degree.
+        heading_deg: Direction to which its top tilts, clockwise from north, to a hundredth of a degree.
         tilt_deg: Of its axis from the vertical, to a hundredth of a degree; 90: lying, 180: upside down.
         length_m: From its first to its last LED's outer edge, to a millimetre.
         user: The user's own bytes.
@@ -80,7 +80,7 @@ class Beacon:
 
     @classmethod
     def unpack(cls, payload: bytes) -> "Beacon":
-        """Read what `pack` wrote.
+        """A beacon from its payload.
 
         Raises:
             BlockError: Too few bytes, or a value out of range.

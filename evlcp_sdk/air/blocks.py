@@ -1,4 +1,4 @@
-"""Blocks: the bytes that one packet carries, a header and a part of a message."""
+"""Blocks: the bytes of one packet, a header and a part of a message."""
 
 import struct
 import zlib
@@ -12,26 +12,26 @@ FORMAT_VERSION = 1
 """Version of the block format."""
 
 DIGEST_BYTES = 4
-"""Bytes of the codebook's digest in a header: two codebooks agree in them by chance once in 2**32."""
+"""Bytes of the codebook's digest in a header: those of two codebooks agree by chance once in 2**32."""
 
 MOST_MESSAGE_BYTES = 0xFFFF
-"""Longest message: what the header's length can express."""
+"""Longest message that the header's length can express."""
 
 _HEADER = struct.Struct("<BIIHH4s")
-_CHECK = struct.Struct("<I")
+_CRC = struct.Struct("<I")
 
 HEADER_BYTES = _HEADER.size
 """Bytes of a block's header."""
 
 _WHITE_SEED = 2463534242
-"""Start of the whitening where the header's CRC is 0: xorshift32 would stay there."""
+"""Start of the whitening if the header's CRC is 0, where xorshift32 would stay."""
 
-_MOST_NUMBER = 0xFFFFFFFF
+_LARGEST_NUMBER = 0xFFFFFFFF
 _MOST_PARTS = 0x10000
 
 
 class Kind(IntEnum):
-    """Numbers of the kinds that are built in; what they mean is in `air.kinds`."""
+    """Numbers of the built-in kinds; `air.kinds` has their meaning."""
 
     BEACON = 1
     TEXT = 2
@@ -42,7 +42,7 @@ class Kind(IntEnum):
 
 
 _KINDS = frozenset(Kind)
-_MOST_KIND = 15
+_LARGEST_KIND = 15
 
 
 class BlockError(EvlcpError):
@@ -51,10 +51,10 @@ class BlockError(EvlcpError):
 
 @dataclass(frozen=True)
 class Message:
-    """A message as its transmitter made it.
+    """A message, whole.
 
     Attributes:
-        kind: Number of its kind: what the payload is, 1 to 15.
+        kind: Number of its kind, which gives the payload its meaning, 1 to 15.
         transmitter_id: Identity of the transmitter, 0 to 2**32 - 1.
         sequence: Number of the message, rising from each to the next of a transmitter, 0 to 2**32 - 1.
         payload: Its bytes.
@@ -69,12 +69,12 @@ class Message:
     payload: bytes
 
     def __post_init__(self) -> None:
-        if not 1 <= self.kind <= _MOST_KIND:
-            raise ConfigError(f"message: kind = {self.kind}, expected 1 to {_MOST_KIND}")
+        if not 1 <= self.kind <= _LARGEST_KIND:
+            raise ConfigError(f"message: kind = {self.kind}, expected 1 to {_LARGEST_KIND}")
         for name in ("transmitter_id", "sequence"):
             value = getattr(self, name)
-            if not 0 <= value <= _MOST_NUMBER:
-                raise ConfigError(f"message: {name} = {value}, expected 0 to {_MOST_NUMBER}")
+            if not 0 <= value <= _LARGEST_NUMBER:
+                raise ConfigError(f"message: {name} = {value}, expected 0 to {_LARGEST_NUMBER}")
         if not 1 <= len(self.payload) <= MOST_MESSAGE_BYTES:
             raise ConfigError(
                 f"message: {len(self.payload)} bytes of {self.kind_name}, expected 1 to {MOST_MESSAGE_BYTES}"
@@ -87,7 +87,7 @@ class Message:
 
     @property
     def text(self) -> str | None:
-        """The payload as text; None if it is not UTF-8, or the message is not a text."""
+        """The payload as text; None if the message is not a text, or not UTF-8."""
         if self.kind != Kind.TEXT:
             return None
         try:
@@ -98,15 +98,14 @@ class Message:
 
 @dataclass(frozen=True)
 class Block:
-    """A part of a message, with the header that every part carries.
+    """A part of a message with its header.
 
     Attributes:
         kind: Number of the message's kind.
         transmitter_id: As in `Message`.
         sequence: As in `Message`.
         index: Number of the part, from 0.
-        length: Bytes of the whole message, without its check; with the size of a block it gives the number of
-            parts.
+        length: Bytes of the whole message, without its CRC, from which the number of parts follows.
         codebook: First `DIGEST_BYTES` bytes of the codebook's digest.
         part: The part's bytes; all parts but the last fill their block.
 
@@ -124,7 +123,7 @@ class Block:
     part: bytes
 
     def pack(self, size: int) -> bytes:
-        """The block as `size` bytes; what the part leaves free is zero, and all but the header whitened."""
+        """The block as `size` bytes, filled up with zeros; all but the header is whitened."""
         head = _HEADER.pack(
             FORMAT_VERSION << 4 | self.kind,
             self.transmitter_id,
@@ -133,19 +132,19 @@ class Block:
             self.length,
             self.codebook,
         )
-        return head + _whitened(head, self.part.ljust(size - HEADER_BYTES, b"\0"))
+        return head + _whiten(head, self.part.ljust(size - HEADER_BYTES, b"\0"))
 
     @classmethod
     def unpack(cls, block: bytes, kinds: Collection[int] = _KINDS) -> "Block":
-        """Read what `pack` wrote.
+        """A block from its bytes.
 
         Args:
             block: The bytes.
-            kinds: Numbers of the kinds that are known.
+            kinds: Numbers of the known kinds.
 
         Raises:
-            BlockError: Another version, an unknown kind, a part that no message of that length has, or bytes
-                behind the part that are not zero.
+            BlockError: The version or kind is unknown, no message of that length has such a part, or bytes
+                after the part are not zero.
         """
         first, transmitter_id, sequence, index, length, codebook = _HEADER.unpack_from(block)
         version, kind = first >> 4, first & 15
@@ -154,12 +153,12 @@ class Block:
         if kind not in kinds:
             raise BlockError(f"block of kind {kind}, expected one of {', '.join(map(str, sorted(kinds)))}")
         room = len(block) - HEADER_BYTES
-        carried = carried_bytes(length, room)
-        if not index * room < carried:
+        total = total_bytes(length, room)
+        if not index * room < total:
             raise BlockError(f"part {index} of a message of {length} bytes, {room} in a part")
-        rest = _whitened(block[:HEADER_BYTES], block[HEADER_BYTES:])
-        end = min(room, carried - index * room)
-        if any(rest[end:]):
+        body = _whiten(block[:HEADER_BYTES], block[HEADER_BYTES:])
+        end = min(room, total - index * room)
+        if any(body[end:]):
             raise BlockError(f"bytes {HEADER_BYTES + end} to {len(block) - 1} of the block: expected zeros")
         return cls(
             Kind(kind) if kind in _KINDS else kind,
@@ -168,46 +167,45 @@ class Block:
             index,
             length,
             codebook,
-            rest[:end],
+            body[:end],
         )
 
 
-def _whitened(head: bytes, rest: bytes) -> bytes:
-    """The bytes behind a header, added modulo 2 to the numbers of xorshift32 that starts with its CRC-32.
+def _whiten(head: bytes, body: bytes) -> bytes:
+    """The bytes after a header, XORed with the numbers of an xorshift32 that starts with the header's CRC-32.
 
-    The numbers are those of Marsaglia 2003 (shifts 13, 17, 5), four bytes each, least significant first.
-    Equal bytes so do not make equal symbols, a light that repeats itself frame by frame; and two blocks of
-    different headers differ in half their bits on air, so that a receiver can tell which packets carry the
-    same one.
+    The numbers are those of Marsaglia 2003 (shifts 13, 17, 5), four bytes each, least significant first. So
+    equal bytes do not make equal symbols, a light that repeats itself frame by frame; and two blocks with
+    different headers differ in half their bits on air, so that a receiver recognises packets of the same one.
     """
     x = zlib.crc32(head) or _WHITE_SEED
     stream = bytearray()
-    while len(stream) < len(rest):
+    while len(stream) < len(body):
         x ^= x << 13 & 0xFFFFFFFF
         x ^= x >> 17
         x ^= x << 5 & 0xFFFFFFFF
         stream += x.to_bytes(4, "little")
-    return bytes(a ^ b for a, b in zip(rest, stream, strict=False))
+    return bytes(a ^ b for a, b in zip(body, stream, strict=False))
 
 
-def carried_bytes(length: int, room: int) -> int:
-    """Bytes that the parts of a message carry: its own and, where one part does not hold them, its check.
+def total_bytes(length: int, room: int) -> int:
+    """Bytes of a message's parts together: its own, with a CRC if it does not fit into one part.
 
     Args:
         length: Bytes of the message.
         room: Bytes of a part.
 
-    >>> carried_bytes(40, 40), carried_bytes(41, 40)
+    >>> total_bytes(40, 40), total_bytes(41, 40)
     (40, 45)
     """
-    return length if length <= room else length + _CHECK.size
+    return length if length <= room else length + _CRC.size
 
 
-def split(message: Message, codebook: bytes, size: int) -> Iterator[Block]:
-    """The blocks of `size` bytes each that carry a message.
+def split_message(message: Message, codebook: bytes, size: int) -> Iterator[Block]:
+    """The blocks of a message, of `size` bytes each.
 
-    A message of several blocks is followed by its CRC-32 (that of zlib): each block is sure by itself, but
-    two messages under one number would pass for one.
+    A message of several blocks is followed by its CRC-32 (that of zlib): each block has its own check, but
+    parts of two messages with one number would pass for one message.
 
     Args:
         message: The message.
@@ -215,16 +213,16 @@ def split(message: Message, codebook: bytes, size: int) -> Iterator[Block]:
         size: Bytes of a block.
 
     Raises:
-        ConfigError: Its parts are more than a header can number.
+        ConfigError: There are more parts than a header can number.
 
-    >>> [b.part.hex() for b in split(Message(Kind.DATA, 1, 0, b"abcde"), bytes(4), HEADER_BYTES + 3)]
+    >>> [b.part.hex() for b in split_message(Message(Kind.DATA, 1, 0, b"abcde"), bytes(4), HEADER_BYTES + 3)]
     ['616263', '646565', 'd88785']
     """
     room, length = size - HEADER_BYTES, len(message.payload)
-    carried = message.payload if length <= room else message.payload + _check(message.payload)
-    if len(carried) > room * _MOST_PARTS:
+    content = message.payload if length <= room else message.payload + _crc(message.payload)
+    if len(content) > room * _MOST_PARTS:
         raise ConfigError(f"message: {length} bytes in parts of {room}, expected at most {_MOST_PARTS} parts")
-    for index, begin in enumerate(range(0, len(carried), room)):
+    for index, begin in enumerate(range(0, len(content), room)):
         yield Block(
             message.kind,
             message.transmitter_id,
@@ -232,29 +230,29 @@ def split(message: Message, codebook: bytes, size: int) -> Iterator[Block]:
             index,
             length,
             codebook,
-            carried[begin : begin + room],
+            content[begin : begin + room],
         )
 
 
-def joined(parts: Sequence[bytes], length: int) -> bytes:
-    """The payload that the parts of a message carry, all of them and in order.
+def join_parts(parts: Sequence[bytes], length: int) -> bytes:
+    """The payload of a message from all its parts, in order.
 
     Args:
-        parts: What `split` made of it.
+        parts: The parts of its blocks.
         length: Bytes of the message.
 
     Raises:
         BlockError: The parts are not those of one message.
 
-    >>> joined([bytes.fromhex(part) for part in ("616263", "646565", "d88785")], 5)
+    >>> join_parts([bytes.fromhex(part) for part in ("616263", "646565", "d88785")], 5)
     b'abcde'
     """
-    carried = b"".join(parts)
-    payload, check = carried[:length], carried[length:]
-    if check != (_check(payload) if len(parts) > 1 else b""):
+    content = b"".join(parts)
+    payload, check = content[:length], content[length:]
+    if check != (_crc(payload) if len(parts) > 1 else b""):
         raise BlockError(f"{len(parts)} parts that are not those of one message of {length} bytes")
     return payload
 
 
-def _check(payload: bytes) -> bytes:
-    return _CHECK.pack(zlib.crc32(payload))
+def _crc(payload: bytes) -> bytes:
+    return _CRC.pack(zlib.crc32(payload))

@@ -1,8 +1,8 @@
 """The codebook: preamble, pilots and codewords that transmitter and receiver share.
 
-All codes are chips, 1 = LED on. Those of air interface 1 are pair codes: a bipolar value b goes on air as the
-chips (-b, +b), so that every value has an edge in its middle (arXiv 2510.17203, section III). Others are of
-any chips: what a camera sees of them are their edges.
+All codes are chips, 1 = LED on. Those of air interface 1 are pair codes (Manchester): a bipolar value b goes
+on air as the chips (-b, +b), so that every value has an edge in its middle (arXiv 2510.17203, section III).
+Other codes may have any chips; a camera sees their edges.
 """
 
 import hashlib
@@ -20,17 +20,17 @@ from evlcp_sdk.errors import ConfigError
 AIR_INTERFACE = 1
 """Version of the built-in air interface: all codes are pair codes."""
 
-_OF_CHIPS = 2
-"""Version that a codebook states whose codes are of any chips."""
+_UNPAIRED = 2
+"""Version in codebooks whose codes are not all pair codes."""
 
 BARKER13 = (1, 1, 1, 1, 1, -1, -1, 1, 1, -1, 1, -1, 1)
 """The Barker code of length 13: all its aperiodic autocorrelation sidelobes are at most 1."""
 
-_LONGEST_OF_PAIRS = 4
-"""Chips from rise to rise in a pair code: 01 10 01 at the most."""
+_LONGEST_PAIR_GAP = 4
+"""Most chips from rise to rise in a pair code: 01 10 01."""
 
 _NEIGHBOURS = 256
-"""Codewords that each is put before to look for long times: all of most modulations."""
+"""Codewords after each one in which the longest gap is sought: all of most modulations."""
 
 Values = NDArray[np.int8]
 Chips = NDArray[np.uint8]
@@ -66,20 +66,20 @@ def chips_of_values(values: ArrayLike) -> Chips:
     return pairs.reshape(*v.shape[:-1], -1).astype(np.uint8)
 
 
-def are_pairs(chips: ArrayLike) -> bool:
-    """Whether chips, along the last axis, are pairs of an off and an on one, in either order.
+def is_pair_code(chips: ArrayLike) -> bool:
+    """Whether chips along the last axis are pairs of one off and one on, in either order.
 
-    >>> are_pairs([0, 1, 1, 0]), are_pairs([0, 1, 0, 0])
+    >>> is_pair_code([0, 1, 1, 0]), is_pair_code([0, 1, 0, 0])
     (True, False)
     """
     c = np.asarray(chips)
     return c.shape[-1] % 2 == 0 and bool((c[..., 0::2] != c[..., 1::2]).all())
 
 
-def codes_of_chips(preamble: ArrayLike, pilots: ArrayLike, codewords: ArrayLike) -> frozenset[str]:
-    """Which of the codes, by these names, are no pair codes."""
+def find_unpaired_codes(preamble: ArrayLike, pilots: ArrayLike, codewords: ArrayLike) -> frozenset[str]:
+    """Names of the codes that are not pair codes."""
     codes = zip(_CODES, (preamble, pilots, codewords), strict=True)
-    return frozenset(name for name, code in codes if not are_pairs(code))
+    return frozenset(name for name, code in codes if not is_pair_code(code))
 
 
 def edges_of_chips(chips: ArrayLike) -> Values:
@@ -115,8 +115,8 @@ class Codebook:
         codewords: One code a symbol, uint8 (S, M).
 
     Raises:
-        ConfigError: A code has other chips than 0 and 1, or two rows have the same edges, so that no camera
-            could tell them apart.
+        ConfigError: A code has chips other than 0 and 1, or two rows have the same edges, so that no camera
+            could distinguish them.
 
     Two codebooks are equal when their digests are.
 
@@ -135,7 +135,7 @@ class Codebook:
             try:
                 given = np.asarray(getattr(self, name))
             except (TypeError, ValueError, OverflowError):
-                # Of no shape that is expected below.
+                # An array of a shape that is refused below.
                 given = np.empty(0)
             allowed = given.ndim == ndim and given.dtype.kind in "bui" and np.isin(given, (0, 1)).all()
             if not allowed or (given.size == 0 and (name != "pilots" or not len(given))):
@@ -153,17 +153,17 @@ class Codebook:
                 edges = edges_of_chips(code)
                 _, first = np.unique(edges, axis=0, return_index=True)
                 if len(first) != len(code):
-                    again = next(row for row in range(len(code)) if row not in first)
-                    like = int(np.flatnonzero((edges == edges[again]).all(1))[0])
-                    what = "are equal" if (code[like] == code[again]).all() else "have the same edges"
-                    raise ConfigError(f"codebook {name}: rows {like} and {again} {what}")
+                    second = next(row for row in range(len(code)) if row not in first)
+                    like = int(np.flatnonzero((edges == edges[second]).all(1))[0])
+                    what = "are equal" if (code[like] == code[second]).all() else "have the same edges"
+                    raise ConfigError(f"codebook {name}: rows {like} and {second} {what}")
 
     @classmethod
     def of_values(cls, profile: str, preamble: ArrayLike, pilots: ArrayLike, codewords: ArrayLike) -> Self:
-        """The codebook of pair codes: bipolar values, -1 and +1, of two chips each.
+        """A codebook of pair codes from bipolar values, -1 and +1, of two chips each.
 
         Raises:
-            ConfigError: A value is another one.
+            ConfigError: A value is neither.
         """
         codes = []
         for name, code in (("preamble", preamble), ("pilots", pilots), ("codewords", codewords)):
@@ -190,135 +190,125 @@ class Codebook:
         return len(self.codewords).bit_length() - 1
 
     @property
-    def carrying(self) -> int:
-        """Symbols that carry bits, 2**m: all, or the first ones of an alphabet that is no power of two."""
+    def data_symbols(self) -> int:
+        """Symbols that carry bits, 2**m: all, or the first of an alphabet whose size is no power of two."""
         return 1 << self.bits_per_symbol
 
     @cached_property
-    def of_chips(self) -> frozenset[str]:
-        """Which of its codes, `preamble`, `pilots` and `codewords`, are no pair codes."""
-        return codes_of_chips(self.preamble, self.pilots, self.codewords)
+    def unpaired_codes(self) -> frozenset[str]:
+        """Which of `preamble`, `pilots` and `codewords` are not pair codes."""
+        return find_unpaired_codes(self.preamble, self.pilots, self.codewords)
 
     @cached_property
-    def pairs(self) -> bool:
+    def is_pair_coded(self) -> bool:
         """Whether all codes are pair codes."""
-        return not self.of_chips
+        return not self.unpaired_codes
 
     def require_pairs(self, role: str, name: str, other: str, codes: Collection[str] = _CODES) -> None:
-        """Refuse codes that an algorithm cannot read, which takes pair codes only.
+        """Raise ConfigError unless the codes that an algorithm reads are pair codes.
 
         Args:
-            role: Its role.
+            role: The algorithm's role.
             name: Its id.
-            other: Id of one that takes any.
-            codes: Those that it reads.
-
-        Raises:
-            ConfigError: A code is none.
+            other: Id of an algorithm for any codes.
+            codes: Names of the codes that it reads.
         """
-        for code in (name for name in codes if name in self.of_chips):
+        for code in (name for name in codes if name in self.unpaired_codes):
             raise ConfigError(
                 f"{role} '{name}' reads pair codes, chips 01 or 10 each, and the {code} are others; try"
                 f" {role}.id = '{other}'"
             )
 
     @property
-    def edge_every(self) -> int:
-        """Chips from one edge that tells codes apart to the next; the first comes after one chip."""
-        return 2 if self.pairs else 1
+    def edge_spacing_chips(self) -> int:
+        """Chips from one edge that distinguishes codes to the next; the first is after one chip."""
+        return 2 if self.is_pair_coded else 1
 
     @property
-    def chips_after(self) -> int:
-        """Chips after a codeword whose first edge its decoding reads: 1, but 0 of pair codes."""
-        return 0 if self.pairs else 1
+    def trailing_chips(self) -> int:
+        """Chips after a codeword up to the last edge that decoding reads: 1, but 0 for pair codes."""
+        return 0 if self.is_pair_coded else 1
 
     @cached_property
     def pilot_edges(self) -> Values:
-        """What pixels of each cluster see in a pilot, 1 on, -1 off, 0 nothing, int8 (K, n).
+        """Edges of each cluster's pilot, 1 on, -1 off, 0 none, int8 (K, n).
 
-        Of a pair code these are its values: the edges in the middle of each pair. Those between two pairs
-        follow from them.
+        For a pair code these are its values, the edges in the middle of each pair, which determine those
+        between pairs.
         """
         return self._edges(self.pilots)
 
     @cached_property
     def codeword_edges(self) -> Values:
-        """The same of each symbol, int8 (S, n)."""
+        """Edges of each symbol's codeword, likewise, int8 (S, n)."""
         return self._edges(self.codewords)
 
     @cached_property
     def pilot_values(self) -> Values:
-        """Values of the pilots, -1 and 1, int8 (K, n); n is 0 where they are no pair codes."""
-        return _values(self.pilots)
+        """Values of the pilots, -1 and 1, int8 (K, n); n is 0 unless they are pair codes."""
+        return _pair_values(self.pilots)
 
     @cached_property
     def codeword_values(self) -> Values:
-        """The same of the symbols' codewords, int8 (S, n)."""
-        return _values(self.codewords)
+        """Values of the codewords, likewise, int8 (S, n)."""
+        return _pair_values(self.codewords)
 
     @cached_property
     def edge_chips(self) -> NDArray[np.int64]:
-        """Chips of a frame, pilot and info segment, behind the edges that tell codes apart, int64 (n,)."""
+        """Chips of a frame right after the edges that distinguish codes, int64 (n,)."""
         pilot, info = self.pilots.shape[1], self.codewords.shape[1]
-        behind = (np.arange(1, pilot, self.edge_every), np.arange(pilot + 1, pilot + info, self.edge_every))
-        return np.concatenate(behind)
+        step = self.edge_spacing_chips
+        return np.concatenate([np.arange(1, pilot, step), np.arange(pilot + 1, pilot + info, step)])
 
     @cached_property
     def longest_gap_chips(self) -> int:
-        """The longest time from one rise to the next while packets are sent, chips.
+        """Most chips from one rise to the next while packets are sent.
 
-        Four in any pair code; of others, as codewords follow one another and pilots.
+        Four for pair codes; for others, over sequences of codewords and pilots.
         """
-        if self.pairs:
-            return _LONGEST_OF_PAIRS
+        if self.is_pair_coded:
+            return _LONGEST_PAIR_GAP
         words = len(self.codewords)
         runs = [self.preamble]
         for pilot in self.pilots:
             runs += [pilot, self.codewords[0]]
-        for apart in range(min(words, _NEIGHBOURS)):
-            following = (np.arange(words) + apart) % words
+        for offset in range(min(words, _NEIGHBOURS)):
+            following = (np.arange(words) + offset) % words
             runs.append(np.concatenate([self.codewords, self.codewords[following]], axis=1).ravel())
         rises = np.flatnonzero(np.diff(np.concatenate(runs).astype(np.int8)) > 0)
         return int(np.diff(rises).max(initial=2))
 
     @cached_property
-    def least_activity(self) -> float:
-        """Edges a chip of the codeword with the fewest, over those of the pilots; half in pair codes."""
-        if self.pairs:
+    def least_edge_ratio(self) -> float:
+        """Edge density of the sparsest codeword, over that of the pilots; half for pair codes."""
+        if self.is_pair_coded:
             return 0.5
         fewest = float(np.abs(edges_of_chips(self.codewords)).mean(1).min())
         pilots = float(np.abs(edges_of_chips(self.pilots)).mean()) if self.pilots.shape[1] > 1 else fewest
         return fewest / pilots if pilots else 1.0
 
     def _edges(self, chips: Chips) -> Values:
-        edges = np.ascontiguousarray(edges_of_chips(chips)[..., :: self.edge_every])
+        edges = np.ascontiguousarray(edges_of_chips(chips)[..., :: self.edge_spacing_chips])
         edges.setflags(write=False)
         return edges
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of the codes in canonical JSON, 64 hex digits; what both ends compare."""
+        """SHA-256 of the codes in canonical JSON, 64 hex digits, which both ends compare."""
         text = json.dumps(self.to_dict(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
     def to_dict(self) -> dict[str, Any]:
         """The codebook as plain lists: of values for pair codes, else of strings of chips."""
-        if self.pairs:
-            codes = (code[..., 1::2].astype(int) * 2 - 1 for code in self._codes())
-            listed: list[Any] = [code.tolist() for code in codes]
-        else:
-            preamble, pilots, codewords = self._codes()
-            listed = [_text(preamble), [_text(row) for row in pilots], [_text(row) for row in codewords]]
-        return {
-            "air_interface": AIR_INTERFACE if self.pairs else _OF_CHIPS,
-            "profile": self.profile,
-            "preamble": listed[0],
-            "pilots": listed[1],
-            "codewords": listed[2],
-        }
-
-    def _codes(self) -> tuple[Chips, Chips, Chips]:
-        return self.preamble, self.pilots, self.codewords
+        codes: dict[str, Any] = {}
+        for name in _CODES:
+            code = getattr(self, name)
+            if self.is_pair_coded:
+                codes[name] = (code[..., 1::2].astype(int) * 2 - 1).tolist()
+            else:
+                codes[name] = _chip_string(code) if code.ndim == 1 else [_chip_string(row) for row in code]
+        version = AIR_INTERFACE if self.is_pair_coded else _UNPAIRED
+        return {"air_interface": version, "profile": self.profile, **codes}
 
     def to_json(self) -> str:
         """The codebook as JSON text, with its digest."""
@@ -363,12 +353,12 @@ class Codebook:
         )
 
 
-def _values(chips: Chips) -> Values:
-    values = edges_of_chips(chips)[:, ::2] if are_pairs(chips) else np.empty((len(chips), 0), np.int8)
+def _pair_values(chips: Chips) -> Values:
+    values = edges_of_chips(chips)[:, ::2] if is_pair_code(chips) else np.empty((len(chips), 0), np.int8)
     values = np.ascontiguousarray(values)
     values.setflags(write=False)
     return values
 
 
-def _text(chips: Chips) -> str:
+def _chip_string(chips: Chips) -> str:
     return "".join(map(str, chips.tolist()))

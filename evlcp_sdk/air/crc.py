@@ -1,8 +1,8 @@
-"""CRC-24 of a message's bits, by which an error-correction algorithm knows that it decoded what was sent.
+"""CRC-24 of a message's bits, by which an error-correction algorithm verifies what it decoded.
 
 Polynomial CRC24C of 3GPP TS 38.212, 5.1: x^24 + x^23 + x^21 + x^20 + x^17 + x^15 + x^13 + x^12 + x^8 + x^4 +
-x^2 + x + 1. The register starts with ones, so that zeros alone, a block of which nothing was received, do not
-pass; bits enter as they are, first bit first, and the register is sent as it is, highest power first.
+x^2 + x + 1. The register starts with ones, so that a block of zeros, of which nothing was received, does not
+pass; bits enter first bit first, and the register is sent highest power first; neither is inverted.
 """
 
 from functools import cache
@@ -25,7 +25,7 @@ def crc24(bits: NDArray[np.uint8], polynomial: int = CRC24C, start: int = _ONES)
     Args:
         bits: The message, uint8 (n,), 0 or 1, in the order in which it is sent.
         polynomial: Generator without its x^24.
-        start: What the register holds before the first bit.
+        start: The register before the first bit.
 
     >>> "".join(map(str, crc24(np.ones(8, np.uint8))))
     '111111111111111100000000'
@@ -45,7 +45,7 @@ def _shift(register: int, polynomial: int) -> int:
 
 @cache
 def _remainders(polynomial: int) -> list[int]:
-    """What each byte leaves in a register of zeros."""
+    """The register after each byte, from a register of zeros."""
     registers = [byte << 16 for byte in range(256)]
     for _ in range(8):
         registers = [_shift(register, polynomial) for register in registers]

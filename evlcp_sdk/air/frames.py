@@ -42,7 +42,7 @@ class PacketFormat:
         chip_rate_hz: float = chip_rate_hz,
         pilot_every: int = pilot_every,
     ) -> "PacketFormat":
-        """The format that a codebook's code lengths imply."""
+        """The format with the lengths of a codebook's codes."""
         return cls(
             preamble_chips=len(codebook.preamble),
             pilot_chips=codebook.pilots.shape[1],
@@ -77,7 +77,7 @@ class PacketFormat:
         return frame % self.pilot_every == 0
 
     def pilot_frame(self, frame: int) -> int:
-        """The frame of the packet whose pilot a frame goes by: itself, or the last before it with one.
+        """The frame whose pilot counts for a frame of the packet: itself, or the last before it with one.
 
         >>> [PacketFormat(pilot_every=4).pilot_frame(n) for n in range(6)]
         [0, 0, 0, 0, 4, 4]
@@ -95,7 +95,7 @@ class PacketFormat:
         return tuple(map(self.frame_start_chip, range(self.frames + 1)))
 
     def gross_bit_s(self, bits_per_symbol: int, clusters: int) -> float:
-        """Bits on air a second, the share of preamble and pilots taken off.
+        """Bits on air a second, without the time for preamble and pilots.
 
         >>> round(PacketFormat().gross_bit_s(6, 16))
         27746
@@ -103,7 +103,7 @@ class PacketFormat:
         return self.frames * clusters * bits_per_symbol * self.chip_rate_hz / self.packet_chips
 
 
-def _checked(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.int64]:
+def _check_symbols(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.int64]:
     s = np.asarray(symbols)
     if s.ndim != 2 or s.shape[1] != codebook.clusters:
         raise ConfigError(f"symbols of shape {s.shape}: expected (frames, {codebook.clusters} clusters)")
@@ -123,13 +123,13 @@ def packet_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -
 
     Args:
         symbols: The packet's symbols.
-        codebook: What they mean.
+        codebook: The codes.
         pilot_every: Frames from one pilot to the next.
 
     Raises:
-        ConfigError: Symbols of another shape or outside the codebook.
+        ConfigError: The symbols have another shape, or are not in the codebook.
     """
-    s = _checked(symbols, codebook)
+    s = _check_symbols(symbols, codebook)
     preamble = np.repeat(codebook.preamble[:, None], codebook.clusters, axis=1)
     pilot, info = codebook.pilots.T, codebook.codewords
     parts = [preamble]
@@ -138,15 +138,15 @@ def packet_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -
     return np.concatenate(parts)
 
 
-def chips_behind(codebook: Codebook, packet: PacketFormat, frame: int) -> NDArray[np.int8]:
-    """The chip that each cluster sends right after a frame of a packet, int8 (K,); -1 where it may be either.
+def chips_after_frame(codebook: Codebook, packet: PacketFormat, frame: int) -> NDArray[np.int8]:
+    """The chip of each cluster right after a frame of a packet, int8 (K,); -1 where it may be either.
 
-    A pilot follows, or the next frame's codeword, or a preamble. After the last packet it is dark, so a
-    preamble that begins lit says nothing.
+    A pilot follows, the next frame's codeword, or a preamble. After the last packet the LEDs are dark, so
+    that the chip is undetermined if preambles begin lit.
 
     >>> book = Codebook("demo", np.array([0, 1]), np.array([[1, 0], [0, 1]]), np.array([[0, 1], [1, 1]]))
     >>> packet = PacketFormat.of(book, frames=3, pilot_every=2)
-    >>> [chips_behind(book, packet, frame).tolist() for frame in range(3)]
+    >>> [chips_after_frame(book, packet, frame).tolist() for frame in range(3)]
     [[-1, -1], [1, 0], [0, 0]]
     """
     last = frame + 1 == packet.frames

@@ -1,4 +1,4 @@
-"""Kinds of messages: what the payload of each means, and how it is shown."""
+"""Kinds of messages: the meaning of each one's payload, and its JSON values."""
 
 import struct
 from abc import ABC, abstractmethod
@@ -18,11 +18,11 @@ _LONGEST_COUNTDOWN_S = 86_400.0
 
 
 class MessageKind(ABC):
-    """What the payload of a message means; a derived class has no state, and its objects are picklable.
+    """The meaning of a message's payload; a derived class has no state, and its objects are picklable.
 
     Attributes:
-        number: What the four bits of a block's header say: 1 to 6 are built in, 7 to 15 are free.
-        name: What it is called in `packets.jsonl`.
+        number: Its number in the four bits of a block's header: 1 to 6 are built in, 7 to 15 are free.
+        name: Its name in `packets.jsonl`.
     """
 
     number: ClassVar[int]
@@ -30,23 +30,23 @@ class MessageKind(ABC):
 
     @abstractmethod
     def pack(self, value: Any) -> bytes:
-        """The payload that says a value.
+        """The payload for a value.
 
         Raises:
-            ConfigError: The value cannot be said.
+            ConfigError: The value cannot be encoded.
         """
 
     @abstractmethod
     def unpack(self, payload: bytes) -> Any:
-        """What a payload says. One that raises is counted as `messages_undecodable`, and not handed on.
+        """The value of a payload; a message that raises is only counted, as `messages_undecodable`.
 
         Raises:
-            BlockError: The bytes mean nothing.
+            BlockError: The bytes are not valid.
         """
 
     @abstractmethod
     def to_dict(self, value: Any) -> Mapping[str, Any]:
-        """What `packets.jsonl` shows of a value, as JSON values."""
+        """A value as JSON values for `packets.jsonl`."""
 
 
 class BeaconKind(MessageKind):
@@ -91,7 +91,7 @@ class TextKind(MessageKind):
 
 
 class DataKind(MessageKind):
-    """Bytes that mean something to somebody else."""
+    """Bytes of a user's own format."""
 
     number = Kind.DATA
     name = "data"
@@ -110,7 +110,7 @@ class DataKind(MessageKind):
 
 
 class SignatureKind(DataKind):
-    """The signature of a beacon; it is not handed on by itself, but with its beacon as `trust`."""
+    """The signature of a beacon; it is not reported by itself, but as its beacon's `trust`."""
 
     number = Kind.SIGNATURE
     name = "signature"
@@ -130,7 +130,7 @@ class TimeKind(MessageKind):
 
     def unpack(self, payload: bytes) -> float:
         """Seconds since 1970."""
-        time_s = _numbers(_TIME, payload, self.name)[0] * 1e-6
+        time_s = _unpack_numbers(_TIME, payload, self.name)[0] * 1e-6
         if not time_s < _LAST_TIME_S:
             raise BlockError(f"time: {time_s} s is after the year 9999")
         return float(time_s)
@@ -145,12 +145,12 @@ class TimeKind(MessageKind):
 
 @dataclass(frozen=True)
 class Countdown:
-    """How long a signal still shows what it does.
+    """The time until a traffic light changes.
 
     Attributes:
         signal: What it shows, one of `SIGNALS`.
-        next_signal: What it will show then.
-        left_s: How long until then, s, from the message's first chip on.
+        next_signal: What it will show next.
+        left_s: Time until then from the message's first chip, s.
 
     >>> CountdownKind().unpack(CountdownKind().pack(Countdown("red", "green", 12.3))).left_s
     12.3
@@ -162,7 +162,7 @@ class Countdown:
 
 
 SIGNALS = ("dark", "red", "red-amber", "amber", "green", "amber-flashing")
-"""What a traffic light shows; their order is their number on air."""
+"""What a traffic light shows; the index is the number on air."""
 
 
 class CountdownKind(MessageKind):
@@ -184,7 +184,7 @@ class CountdownKind(MessageKind):
 
     def unpack(self, payload: bytes) -> Countdown:
         """A countdown."""
-        signal, then, left_ms = _numbers(_COUNTDOWN, payload, self.name)
+        signal, then, left_ms = _unpack_numbers(_COUNTDOWN, payload, self.name)
         if max(signal, then) >= len(SIGNALS):
             raise BlockError(f"countdown: signal {max(signal, then)}, expected 0 to {len(SIGNALS) - 1}")
         return Countdown(SIGNALS[signal], SIGNALS[then], left_ms / 1e3)
@@ -194,7 +194,7 @@ class CountdownKind(MessageKind):
         return asdict(value)
 
 
-def _numbers(form: struct.Struct, payload: bytes, name: str) -> tuple[int, ...]:
+def _unpack_numbers(form: struct.Struct, payload: bytes, name: str) -> tuple[int, ...]:
     if len(payload) != form.size:
         raise BlockError(f"{name} of {len(payload)} bytes, expected {form.size}")
     return form.unpack(payload)
@@ -204,11 +204,11 @@ BUILT_IN_KINDS: Mapping[int, MessageKind] = {
     kind.number: kind
     for kind in (BeaconKind(), TextKind(), DataKind(), SignatureKind(), TimeKind(), CountdownKind())
 }
-"""The kinds that the format itself has, by number."""
+"""The built-in kinds by number."""
 
 
-def kind_named(name: str, kinds: Mapping[int, MessageKind]) -> MessageKind:
-    """The kind of a name.
+def find_kind(name: str, kinds: Mapping[int, MessageKind]) -> MessageKind:
+    """The kind of messages with a name.
 
     Raises:
         ConfigError: There is none.

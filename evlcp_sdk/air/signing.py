@@ -1,6 +1,6 @@
-"""Signed beacons: Ed25519 (RFC 8032), so that no lamp but the operator's can say where it is.
+"""Signed beacons: Ed25519 (RFC 8032), so that no lamp but the operator's can give its position.
 
-Needs the extra `sign` (package `cryptography`) to make keys, to sign, and to check against trusted keys.
+Needs the extra `sign` (package `cryptography`) to make keys, to sign, and to verify.
 """
 
 import hashlib
@@ -32,19 +32,19 @@ _DOMAIN = b"EVLCP beacon 1\0"
 _SIGNED_HEAD = struct.Struct("<II4s")
 
 
-def _check_installed() -> None:
+def _require_cryptography() -> None:
     if find_spec("cryptography") is None:
         raise ConfigError("signed beacons need the extra: pip install 'evlcp-sdk[sign]'")
 
 
 def make_key(path: Path) -> str:
-    """Make a private key, write it as PEM (PKCS #8, for its owner's eyes only), return its public key in hex.
+    """Write a new private key as PEM (PKCS #8, readable by its owner alone); return its public key in hex.
 
     Raises:
         ConfigError: The extra is not installed.
         OutputError: The file exists, or cannot be written.
     """
-    _check_installed()
+    _require_cryptography()
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
@@ -61,10 +61,10 @@ def read_key(path: Path) -> "Ed25519PrivateKey":
 
     Raises:
         ConfigError: The extra is not installed.
-        InputError: The file cannot be read, others than its owner may use it, or it holds no Ed25519 key
+        InputError: The file cannot be read, is accessible to others than its owner, or holds no Ed25519 key
             without a password.
     """
-    _check_installed()
+    _require_cryptography()
     from cryptography.exceptions import UnsupportedAlgorithm
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -80,12 +80,12 @@ def read_key(path: Path) -> "Ed25519PrivateKey":
 
 
 def public_key(key: "Ed25519PrivateKey") -> str:
-    """The public key of a private one, 64 hex digits: what `messages.trusted_keys` takes."""
+    """The public key of a private one, 64 hex digits, for `messages.trusted_keys`."""
     return key.public_key().public_bytes_raw().hex()
 
 
-def signed_bytes(beacon: Message, codebook: bytes) -> bytes:
-    """What a signature is over: all that a beacon's blocks say.
+def signature_input(beacon: Message, codebook: bytes) -> bytes:
+    """The bytes that a beacon's signature covers: all content of its blocks.
 
     Args:
         beacon: The beacon.
@@ -103,7 +103,7 @@ def sign(beacon: Message, codebook: bytes, key: "Ed25519PrivateKey") -> Message:
         key: The operator's private key.
     """
     name = _key_name(key.public_key().public_bytes_raw())
-    payload = name + key.sign(signed_bytes(beacon, codebook))
+    payload = name + key.sign(signature_input(beacon, codebook))
     return Message(Kind.SIGNATURE, beacon.transmitter_id, beacon.sequence, payload)
 
 
@@ -114,9 +114,9 @@ class TrustedKey:
     A key with several of these may sign what any of them allows.
 
     Raises:
-        ConfigError: The key or a time is not one, the area is not whole, or a range is empty.
+        ConfigError: The key or a time is invalid, the area incomplete, or a range empty.
 
-    >>> TrustedKey("00" * 32, first_id=7, last_id=9, valid_to="2030-01-01").for_id(8)
+    >>> TrustedKey("00" * 32, first_id=7, last_id=9, valid_to="2030-01-01").covers_id(8)
     True
     """
 
@@ -138,7 +138,7 @@ class TrustedKey:
     valid_to: Annotated[str, Field(description="Time until which it is valid, likewise.")] = ""
 
     def __post_init__(self) -> None:
-        _key_bytes(self.key, "messages.trusted_keys: key")
+        _parse_public_key(self.key, "messages.trusted_keys: key")
         begin, end = self._validity
         for name, low, high, shown in (
             ("last_id", self.first_id, self.last_id, f"first_id, {self.first_id}"),
@@ -159,26 +159,26 @@ class TrustedKey:
             return None
         return self.latitude_deg, self.longitude_deg, self.radius_m
 
-    def for_id(self, transmitter_id: int) -> bool:
-        """Whether it may sign for a transmitter."""
+    def covers_id(self, transmitter_id: int) -> bool:
+        """Whether the key may sign for a transmitter."""
         return self.first_id <= transmitter_id <= self.last_id
 
-    def holds_at(self, time_s: float) -> bool:
-        """Whether it is valid at a time, seconds since 1970."""
+    def is_valid_at(self, time_s: float) -> bool:
+        """Whether the key is valid at a time, seconds since 1970."""
         begin, end = self._validity
         return begin <= time_s <= end
 
     @property
     def _validity(self) -> tuple[float, float]:
         return (
-            _time_s(self.valid_from, "valid_from", -math.inf),
-            _time_s(self.valid_to, "valid_to", math.inf),
+            _parse_time_s(self.valid_from, "valid_from", -math.inf),
+            _parse_time_s(self.valid_to, "valid_to", math.inf),
         )
 
 
-def _time_s(text: str, name: str, without: float) -> float:
+def _parse_time_s(text: str, name: str, default: float) -> float:
     if not text:
-        return without
+        return default
     try:
         time = datetime.fromisoformat(text)
         return (time if time.tzinfo is not None else time.replace(tzinfo=UTC)).timestamp()
@@ -188,7 +188,7 @@ def _time_s(text: str, name: str, without: float) -> float:
         ) from fault
 
 
-def _key_bytes(text: str, name: str) -> bytes:
+def _parse_public_key(text: str, name: str) -> bytes:
     try:
         key = bytes.fromhex(text)
     except ValueError:
@@ -201,20 +201,20 @@ def _key_bytes(text: str, name: str) -> bytes:
 
 
 class TrustedKeys:
-    """The public keys that a receiver trusts, and those that it does not trust any more.
+    """The public keys that a receiver trusts, and those that are revoked.
 
     Args:
         trusted: Public keys, and what each may sign.
-        revoked: Public keys whose beacons are forged, whenever they were signed; 64 hex digits each.
+        revoked: Public keys whose beacons count as forged, whenever they were signed; 64 hex digits each.
 
     Raises:
-        ConfigError: A key is not valid, or there are keys and the extra is not installed.
+        ConfigError: A key is invalid, or there are keys and the extra is not installed.
     """
 
     def __init__(self, trusted: Sequence[TrustedKey], revoked: Sequence[str] = ()) -> None:
-        gone = [_key_bytes(text, f"messages.revoked_keys[{i}]") for i, text in enumerate(revoked)]
-        self._revoked = frozenset(map(_key_name, gone))
-        self._keys = {_key_name(key): key for key in gone}
+        revoked_keys = [_parse_public_key(t, f"messages.revoked_keys[{i}]") for i, t in enumerate(revoked)]
+        self._revoked = frozenset(map(_key_name, revoked_keys))
+        self._keys = {_key_name(key): key for key in revoked_keys}
         self._grants: dict[bytes, tuple[TrustedKey, ...]] = {}
         for grant in trusted:
             key = bytes.fromhex(grant.key)
@@ -222,18 +222,18 @@ class TrustedKeys:
             self._keys[name] = key
             self._grants[name] = (*self._grants.get(name, ()), grant)
         if self._keys:
-            _check_installed()
+            _require_cryptography()
 
-    def revoked(self, signature: Message) -> bool:
-        """Whether a signature names a key that is revoked."""
+    def is_revoked(self, signature: Message) -> bool:
+        """Whether the key that a signature names is revoked."""
         return signature.payload[:KEY_NAME_BYTES] in self._revoked
 
-    def grants(self, signature: Message) -> tuple[TrustedKey, ...]:
-        """What the key that a signature names may sign; empty if it is not trusted."""
+    def find_grants(self, signature: Message) -> tuple[TrustedKey, ...]:
+        """What the key that a signature names may sign; empty for an untrusted key."""
         return self._grants.get(signature.payload[:KEY_NAME_BYTES], ())
 
-    def check(self, beacon: Message, codebook: bytes, signature: Message) -> bool | None:
-        """Whether a signature is that of a beacon; None if it names no known key.
+    def verify(self, beacon: Message, codebook: bytes, signature: Message) -> bool | None:
+        """Whether a beacon's signature is correct; None if it names no known key.
 
         Args:
             beacon: The beacon.
@@ -250,7 +250,7 @@ class TrustedKeys:
         if len(value) != _SIGNATURE_BYTES:
             return False
         try:
-            Ed25519PublicKey.from_public_bytes(key).verify(value, signed_bytes(beacon, codebook))
+            Ed25519PublicKey.from_public_bytes(key).verify(value, signature_input(beacon, codebook))
         except InvalidSignature:
             return False
         return True

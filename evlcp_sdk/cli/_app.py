@@ -131,11 +131,11 @@ def make_app(*modules: str) -> typer.Typer:
 def add_plugin_commands(app: typer.Typer, registry: "Registry") -> None:
     """Add the commands of plugins; a plugin whose commands cannot be built, or are there, is left out."""
     known = _names(app)
-    for plugin in registry.plugins("evlcp_register_commands"):
+    for plugin in registry.plugins_with_hook("evlcp_register_commands"):
         added = typer.Typer()
-        for _ in registry.ask("evlcp_register_commands", only=plugin, app=added):
+        for _ in registry.call_hook("evlcp_register_commands", only=plugin, app=added):
             reason = None
-            if registry.owner(plugin)[0] != "evlcp-sdk":
+            if registry.distribution_of(plugin)[0] != "evlcp-sdk":
                 # Ours are built in any case, and tested.
                 reason = _fault_of(added, known)
             if reason is not None:

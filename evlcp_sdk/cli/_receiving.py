@@ -42,13 +42,13 @@ class LinkOptions:
 
     def load(self, registry: "Registry") -> "tuple[Link, ...]":
         """The links; says on stderr, before anything is read, which of them a receiver cannot tell apart."""
-        from evlcp_sdk.link.several import load_links, named_links
+        from evlcp_sdk.link.several import load_links, name_links
 
         links = load_links(self.link_files, self.overrides or [], registry)
         if len(links) > 1:
             from evlcp_sdk.diagnosis.of_light import find_alike_links
 
-            for warning in find_alike_links(named_links(links)):
+            for warning in find_alike_links(name_links(links)):
                 complain(f"warning: {warning}")
         return links
 
@@ -157,12 +157,12 @@ class PlaceOptions:
                 if given:
                     raise typer.BadParameter("needs --sites", param_hint=name)
             return None
-        from evlcp_sdk.link.several import named_links, placing_links
+        from evlcp_sdk.link.several import name_links, select_positioning_links
         from evlcp_sdk.place.gnss import GnssLog
         from evlcp_sdk.place.navigator import PositionPlan
         from evlcp_sdk.scene.sites import load_sites
 
-        link = next(iter(placing_links(named_links(links)).values()))
+        link = next(iter(select_positioning_links(name_links(links)).values()))
         log = None
         if self.gnss is not None:
             log = GnssLog.read(self.gnss, self.clock_zero, link.position.gnss_sigma_m)

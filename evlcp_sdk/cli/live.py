@@ -175,11 +175,11 @@ def _served(
     clock: ClockZero,
 ) -> Iterator[None]:
     """Serve what was chosen, and say where."""
-    from evlcp_sdk.link.several import named_links
+    from evlcp_sdk.link.several import name_links
     from evlcp_sdk.live.services import serve
 
     sites = plan.sites if plan is not None else ()
-    names = named_links(links)
+    names = name_links(links)
     with serve(chosen, publisher, names, name=Path(url).name, sites=sites, clock_zero=clock) as services:
         for name, server in services.items():
             complain(f"{_SERVED[name]} at {server.url}")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from evlcp_sdk.cli._common import Json, echo, print_json
 
 if TYPE_CHECKING:
-    from evlcp_sdk.plugin.registry import Installed, Registry
+    from evlcp_sdk.plugin.registry import InstalledAlgorithm, Registry
 
 
 def plugins(as_json: Json = False) -> None:
@@ -32,13 +32,13 @@ def table_of(registry: Registry) -> dict[str, list[dict[str, Any]]]:
     """What is installed, as `--json` prints it: roles, algorithms, broken plugins."""
     from collections import Counter
 
-    from evlcp_sdk.plugin.records import installed_sinks, message_kinds
+    from evlcp_sdk.plugin.records import find_message_kinds, find_sinks
     from evlcp_sdk.plugin.roles import ROLES
 
     # Asked for what else they bring, more of them may turn out to be broken.
-    installed_sinks(registry)
-    message_kinds(registry)
-    entries = registry.installed()
+    find_sinks(registry)
+    find_message_kinds(registry)
+    entries = registry.list_algorithms()
     count = Counter((e.algorithm.role, e.algorithm.id) for e in entries)
     return {
         "roles": [{"role": r.name, "verb": r.verb, "default": r.default} for r in ROLES.values()],
@@ -59,7 +59,7 @@ def table_of(registry: Registry) -> dict[str, list[dict[str, Any]]]:
     }
 
 
-def _fault(one: Installed) -> str | None:
+def _fault(one: InstalledAlgorithm) -> str | None:
     """Why an algorithm of somebody else's cannot be used; None for one that can."""
     from evlcp_sdk.errors import PluginError
     from evlcp_sdk.plugin.registry import load_class

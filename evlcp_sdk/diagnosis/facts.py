@@ -234,7 +234,7 @@ def other_codewords(link: Link, registry: Registry) -> dict[str, NDArray[np.uint
     found: dict[str, NDArray[np.uint8]] = {}
     if "modulation" not in link.table:
         return found
-    for installed in registry.installed("modulation"):
+    for installed in registry.list_algorithms("modulation"):
         name = installed.algorithm.id
         if name == link.table["modulation"]["id"]:
             continue

@@ -266,7 +266,7 @@ def check_orientation(facts: Facts, one: TransmitterTally) -> Found:
 
 def check_codewords(facts: Facts, one: TransmitterTally) -> Found:
     """Codewords that never occur, and the modulation that they are all of."""
-    link, codewords, name = facts.link, facts.link.codebook.carrying, facts.better_value("modulation.id")
+    link, codewords, name = facts.link, facts.link.codebook.data_symbols, facts.better_value("modulation.id")
     never = count_missing_codewords(one, link)
     if not never and name is None:
         yield f"all of {codewords} that should occur do"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from evlcp_sdk.clock import TimeGrain
 from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Found, has_rate, in_ms
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.link.several import alike_links
+from evlcp_sdk.link.several import find_ambiguous_links
 from evlcp_sdk.suggestions import format_count
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def check_room(facts: Facts) -> Found:
 
 def find_alike_links(links: Mapping[str, Link]) -> Iterator[Diagnostic]:
     """Links of which nothing on air tells one from the other, by name: known before anything is read."""
-    for one, other in alike_links(links):
+    for one, other in find_ambiguous_links(links):
         yield Diagnostic(
             "alike-links",
             f"what one of the links '{one}' and '{other}' sends, the other may read: the rates are alike,"

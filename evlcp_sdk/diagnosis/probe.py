@@ -81,7 +81,7 @@ class Trial:
     def rank(self) -> tuple[bool, bool, float, float, int]:
         """What trials are sorted by, the best largest."""
         share, quality = round(self.share, 2), round(self.quality, 1)
-        return self.fits, bool(self.said), share, quality, -self.link.codebook.carrying
+        return self.fits, bool(self.said), share, quality, -self.link.codebook.data_symbols
 
     def options(self) -> str:
         """The changes as options of the command line; empty for the link as it was given."""
@@ -116,7 +116,7 @@ def better_links(
     """
     best = try_link(link, events)
     yield best
-    others = [one.algorithm.id for one in registry.installed("modulation")]
+    others = [one.algorithm.id for one in registry.list_algorithms("modulation")]
     # Modulations of the same length only differ in what is read from frames that are accepted.
     alike = [one for one in others if _chips(_with(link, {"modulation.id": one}, registry)) == _chips(link)]
     rest = [one for one in others if one not in alike]
@@ -150,7 +150,7 @@ def infer_links(link: Link, lights: Iterable[Events], registry: Registry) -> Ite
 
     A light is the events of what may be one LED.
     """
-    for light, installed in product(lights, registry.installed("framing")):
+    for light, installed in product(lights, registry.list_algorithms("framing")):
         changes: dict[str, Any] = {"framing.id": installed.algorithm.id}
         if link.codebook.clusters > 1:
             changes |= {f"bar.{key}": 1 for key in ("rows", "columns", "cluster_rows", "cluster_columns")}

@@ -232,7 +232,7 @@ def count_missing_codewords(one: TransmitterTally, link: Link) -> int:
 
     Packets may repeat one another, so that all of them say no more than one.
     """
-    codewords = link.codebook.carrying
+    codewords = link.codebook.data_symbols
     never = codewords - sum(symbol < codewords for symbol in one.values)
     if not one.given or not never or (link.characters_on_air and not one.blocks):
         return 0

@@ -195,7 +195,7 @@ class _CameraReader(ChunkReader):
             return
         total = int(status.ring.dropped_packets)
         if total > self._dropped_before:
-            self.dropped = self.dropped.more(total - self._dropped_before, self.bytes_read)
+            self.dropped = self.dropped.add(total - self._dropped_before, self.bytes_read)
         self._dropped_before = total
         engaged = bool(status.ring.clutch_engaged)
         self._overflows += engaged and not self._engaged

@@ -230,7 +230,7 @@ class ColumnSource(EventSource):
         if good.all():
             return piece
         kept = np.flatnonzero(good)
-        self._dropped = self._dropped.more(len(good) - len(kept), piece.row_number(int((~good).argmax())))
+        self._dropped = self._dropped.add(len(good) - len(kept), piece.row_number(int((~good).argmax())))
         columns = tuple(column[kept] for column in piece.columns)
         return replace(piece, columns=columns, row_number=lambda row: piece.row_number(int(kept[row])))
 

@@ -87,7 +87,7 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
         return _open_replay(name, registry)
     if scheme in _OPENERS:
         return _OPENERS[scheme](name)
-    asked = sorted(registry.plugins("evlcp_open_events"))
+    asked = sorted(registry.plugins_with_hook("evlcp_open_events"))
     broken = "".join(f"; {plugin}" for plugin in registry.broken)
     raise InputError(
         f"{url}: scheme '{scheme}', expected {', '.join(f'{one}:' for one in ('file', 'replay', *_OPENERS))}"

@@ -46,7 +46,7 @@ class WrappingSource(EventSource):
     @property
     def losses(self) -> dict[str, Loss]:
         """The losses of the source since it was first opened."""
-        return Loss.added(self._past_losses, self._source.losses)
+        return Loss.merge(self._past_losses, self._source.losses)
 
     def close(self) -> None:
         """Close the source."""

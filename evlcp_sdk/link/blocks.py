@@ -20,14 +20,14 @@ def packet_bits(codebook: Codebook, packet: PacketFormat) -> int:
     return packet.frames * codebook.clusters * codebook.bits_per_symbol
 
 
-def interleaver(bits: int) -> NDArray[np.int64]:
-    """Where on air each coded bit goes, int64 (bits,): the places 0, 1, ... in the order of random numbers.
+def interleaver_order(bits: int) -> NDArray[np.int64]:
+    """Place on air of each coded bit, int64 (bits,): the places 0, 1, ... sorted by random numbers.
 
     The numbers are those of the generator xorshift32 (Marsaglia 2003, shifts 13, 17, 5), one a place. A lost
-    cluster or frame so takes bits from all over the code. An order without chance, like multiples of the
-    golden ratio, spreads them more evenly but is a poor one for a polar code, whose own order is as regular.
+    cluster or frame then takes bits from the whole code. A regular order, such as multiples of the golden
+    ratio, spreads them more evenly, but suits a polar code badly, whose own order is as regular.
 
-    >>> interleaver(10).tolist()
+    >>> interleaver_order(10).tolist()
     [5, 7, 0, 8, 6, 3, 2, 1, 9, 4]
     """
     numbers = []
@@ -41,7 +41,7 @@ def interleaver(bits: int) -> NDArray[np.int64]:
 
 
 class BlockCoder:
-    """Puts one block on each packet, and reads it from a packet's soft bits.
+    """Encodes one block in each packet, and decodes it from the packet's soft bits.
 
     Args:
         codebook: The codes that both ends share.
@@ -66,18 +66,18 @@ class BlockCoder:
                 f" {self.block_bytes} bytes, expected at least {HEADER_BYTES + 1};"
                 " raise air.frames_per_packet or the rate of the error correction"
             )
-        self._order = interleaver(self.bits)
+        self._order = interleaver_order(self.bits)
 
     @cached_property
     def digest(self) -> bytes:
-        """The codebook's digest as blocks carry it."""
+        """The codebook's digest in blocks' headers."""
         return bytes.fromhex(self.codebook.digest)[:DIGEST_BYTES]
 
-    def symbols(self, block: bytes) -> NDArray[np.int64]:
+    def encode_symbols(self, block: bytes) -> NDArray[np.int64]:
         """Symbols of the packet that carries a block, int64 (frames, clusters)."""
-        return symbols_of_bits(self.air_bits(block), self.codebook.bits_per_symbol, self.codebook.clusters)
+        return symbols_of_bits(self.encode_bits(block), self.codebook.bits_per_symbol, self.codebook.clusters)
 
-    def air_bits(self, block: bytes) -> NDArray[np.uint8]:
+    def encode_bits(self, block: bytes) -> NDArray[np.uint8]:
         """Bits of the packet that carries a block of `block_bytes` bytes, uint8 (bits,)."""
         message = np.zeros(self._code.message_bits, np.uint8)
         message[: 8 * self.block_bytes] = np.unpackbits(np.frombuffer(block, np.uint8))
@@ -85,14 +85,14 @@ class BlockCoder:
         air[self._order] = self._code.encode(message)
         return air
 
-    def block(self, llr: NDArray[np.float32]) -> bytes | None:
-        """The block that a packet carries; None if the code's check fails.
+    def decode_block(self, llr: NDArray[np.float32]) -> bytes | None:
+        """The block of a packet; None if the code's check fails.
 
         Args:
             llr: LLRs ln P(bit 0) / P(bit 1) of the packet's bits in the order on air, float32 (bits,); 0 for
                 a bit that was not received.
         """
-        # Fewer bits than the message has say nothing of the rest of it.
+        # Fewer bits than the message has cannot determine it.
         if np.count_nonzero(llr) < self._code.message_bits:
             return None
         found = self._code.decode(np.ascontiguousarray(llr[self._order], np.float32))

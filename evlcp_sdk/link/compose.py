@@ -1,4 +1,4 @@
-"""Messages to the packets that a transmitter plays."""
+"""Messages as the packets that a transmitter plays."""
 
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.beacons import Beacon
-from evlcp_sdk.air.blocks import Kind, Message, split
-from evlcp_sdk.air.kinds import kind_named
+from evlcp_sdk.air.blocks import Kind, Message, split_message
+from evlcp_sdk.air.kinds import find_kind
 from evlcp_sdk.air.signing import read_key, sign
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import BlockCoder
@@ -31,21 +31,21 @@ def compose(
     sequence: int | None = None,
     repeat: int = 1,
 ) -> NDArray[np.int64]:
-    """Put messages on packets: the symbols that a transmitter sends, int64 (packets, frames, clusters).
+    """The symbols of packets with messages, int64 (packets, frames, clusters).
 
-    Several messages at once follow one another: beacon, its signature, text, data, others.
+    Several messages follow one another: beacon, its signature, text, data, others.
 
     Args:
         link: The configuration, or a `link.toml`; None for all defaults.
         text: A text.
         data: Bytes.
-        beacon: What a beacon says; of a bar's site, where it stands.
-        user: The user's own bytes in the beacon of a site.
+        beacon: A beacon, or the site of the bar that sends it.
+        user: The user's own bytes in a site's beacon.
         key: File of the private key that signs the beacon (needs the extra `sign`).
-        other: What messages of other installed kinds say, by the kind's name.
-        transmitter_id: Who sends; None for the site's id, or 0.
+        other: Values of messages of other installed kinds, by the kind's name.
+        transmitter_id: The sender; None for the site's id, or 0.
         sequence: Number of the messages; None for the seconds since 1970, so that it rises.
-        repeat: How many times in a row each packet is sent.
+        repeat: Times in a row that each packet is sent.
 
     Raises:
         ConfigError: Nothing to send, a kind that is not installed, a message that is too long or a number out
@@ -58,7 +58,7 @@ def compose(
     link = link if isinstance(link, Link) else load_link(link)
     if repeat < 1:
         raise ConfigError(f"repeat = {repeat}, expected 1 or more")
-    messages = messages_of(
+    messages = make_messages(
         link,
         text=text,
         data=data,
@@ -69,10 +69,10 @@ def compose(
         transmitter_id=transmitter_id,
         sequence=sequence,
     )
-    return packets_of(messages, link.block_coder(), repeat)
+    return encode_messages(messages, link.block_coder(), repeat)
 
 
-def messages_of(
+def make_messages(
     link: Link,
     *,
     text: str | None = None,
@@ -84,34 +84,33 @@ def messages_of(
     transmitter_id: int | None = None,
     sequence: int | None = None,
 ) -> list[Message]:
-    """The messages that `compose` puts on packets; arguments and faults as there."""
+    """The messages that `compose` encodes; arguments and errors as there."""
     if transmitter_id is None:
         transmitter_id = beacon.transmitter_id if isinstance(beacon, BarSite) else 0
     number = int(time.time()) if sequence is None else sequence
-    found: list[Message] = []
+    messages: list[Message] = []
     if beacon is not None:
-        sent = beacon_of_site(beacon, user) if isinstance(beacon, BarSite) else beacon
-        found.append(Message(Kind.BEACON, transmitter_id, number, sent.pack()))
+        content = beacon_of_site(beacon, user) if isinstance(beacon, BarSite) else beacon
+        messages.append(Message(Kind.BEACON, transmitter_id, number, content.pack()))
         if key is not None:
-            digest = link.block_coder().digest
-            found.append(sign(found[0], digest, read_key(Path(key))))
+            messages.append(sign(messages[0], link.block_coder().digest, read_key(Path(key))))
     if text is not None:
-        found.append(Message(Kind.TEXT, transmitter_id, number, utf8(text, "text")))
+        messages.append(Message(Kind.TEXT, transmitter_id, number, encode_utf8(text, "text")))
     if data is not None:
-        found.append(Message(Kind.DATA, transmitter_id, number, bytes(data)))
+        messages.append(Message(Kind.DATA, transmitter_id, number, bytes(data)))
     for name, value in (other or {}).items():
-        kind = kind_named(name, link.kinds)
-        found.append(Message(kind.number, transmitter_id, number, kind.pack(value)))
-    if not found:
+        kind = find_kind(name, link.kinds)
+        messages.append(Message(kind.number, transmitter_id, number, kind.pack(value)))
+    if not messages:
         raise ConfigError("nothing to send: give a text, data or a beacon")
-    return found
+    return messages
 
 
-def utf8(text: str, name: str) -> bytes:
+def encode_utf8(text: str, name: str) -> bytes:
     """The bytes of a text; a shell's bytes that are not UTF-8 arrive as lone surrogates.
 
     Raises:
-        ConfigError: There are such.
+        ConfigError: There are such characters.
     """
     try:
         return text.encode()
@@ -119,32 +118,28 @@ def utf8(text: str, name: str) -> bytes:
         raise ConfigError(f"{name}: character {fault.start + 1} is not UTF-8; send bytes as data") from fault
 
 
-def packets_of(messages: Iterable[Message], coder: BlockCoder, repeat: int = 1) -> NDArray[np.int64]:
-    """Symbols of the packets that carry messages, one after another, int64 (packets, frames, clusters).
+def encode_messages(messages: Iterable[Message], coder: BlockCoder, repeat: int = 1) -> NDArray[np.int64]:
+    """Symbols of the packets with messages, one after another, int64 (packets, frames, clusters).
 
     Args:
         messages: The messages, in the order in which they are sent.
-        coder: How packets carry blocks.
-        repeat: How many times in a row each packet is sent.
+        coder: Encodes their blocks.
+        repeat: Times in a row that each packet is sent.
     """
-    return np.stack(list(each_packet(messages, coder, repeat)))
+    return np.stack(list(iterate_packets(messages, coder, repeat)))
 
 
-def each_packet(
+def iterate_packets(
     messages: Iterable[Message], coder: BlockCoder, repeat: int = 1
 ) -> Iterator[NDArray[np.int64]]:
-    """The same one by one, int64 (frames, clusters), each made when it is taken."""
-    blocks = [block for one in messages for block in split(one, coder.digest, coder.block_bytes)]
-    return (packet for block in blocks for packet in [coder.symbols(block.pack(coder.block_bytes))] * repeat)
+    """Symbols of the same packets one by one, int64 (frames, clusters), each encoded on demand."""
+    blocks = [block for one in messages for block in split_message(one, coder.digest, coder.block_bytes)]
+    packets = (coder.encode_symbols(block.pack(coder.block_bytes)) for block in blocks)
+    return (packet for packet in packets for _ in range(repeat))
 
 
 def beacon_of_site(site: BarSite, user: bytes = b"") -> Beacon:
-    """What a bar's beacon says.
-
-    Args:
-        site: Where the bar stands.
-        user: The user's own bytes.
-    """
+    """The beacon of a bar at a site, with the user's own bytes."""
     return Beacon(
         site.latitude_deg,
         site.longitude_deg,

@@ -1,6 +1,6 @@
 """The link: what both ends agree on and how the receiver works, from `link.toml` to checked objects.
 
-One table a role (`[ranging]`: `id = "joint-scale"`, its parameters flat beside it), and `[camera]`,
+It has a table for each role (`[ranging]`: `id = "joint-scale"`, with its parameters), and `[camera]`,
 `[camera_sigma]`, `[bar]`, `[air]`, `[regions]`, `[messages]` and `[position]`. Every default is written out
 before anything runs, so that the resolved table alone reproduces a result. See `docs/configuration.md`.
 """
@@ -13,13 +13,13 @@ from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, overload
 
-from evlcp_sdk.air.codebook import Codebook, codes_of_chips
+from evlcp_sdk.air.codebook import Codebook, find_unpaired_codes
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, PluginError, UnknownAlgorithmError
 from evlcp_sdk.link.blocks import BlockCoder, packet_bits
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
-from evlcp_sdk.plugin.records import message_kinds
+from evlcp_sdk.plugin.records import find_message_kinds
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import (
     ROLES,
@@ -63,15 +63,15 @@ class Link:
         regions: Parameters of the region detector.
         position: Parameters of the positions.
         messages: How messages are read.
-        algorithms: Role to algorithm, one of each role but for those that are no step of its framing.
+        algorithms: Role to algorithm, for all roles but those that are no step of its framing.
         revisions: Role to the algorithm's revision.
         codebook: The codes that both ends share.
         packet: Lengths of a packet's parts.
         table: The resolved configuration, every default written out; plain values as in TOML.
         digest: SHA-256 of table, codebook digest and revisions, 64 hex digits.
-        kinds: The kinds of messages that are understood, by number; those that are installed.
-        name: What a receiver of several links calls it: its file's without `.toml`; empty without a file.
-        built_in: Roles whose algorithm comes with the SDK: what it gives is checked by tests alone.
+        kinds: The installed kinds of messages, by number.
+        name: Its name among several links: its file's without `.toml`; empty without a file.
+        built_in: Roles whose algorithm comes with the SDK, so that tests alone check what it gives.
 
     Two links are equal when their digests are.
     """
@@ -106,7 +106,7 @@ class Link:
 
     @property
     def characters_on_air(self) -> bool:
-        """Whether a symbol is the code of a character, as its framing says."""
+        """Whether a symbol is the code of a character; its framing determines it."""
         framing = self.algorithms.get("framing")
         return framing is not None and bool(framing.characters_on_air)
 
@@ -139,7 +139,7 @@ class Link:
             ConfigError: It is no step of the link's framing.
         """
         if role in STEPS and role not in self.algorithms:
-            raise ConfigError(f"{role}{_unused(self.table['framing']['id'])}")
+            raise ConfigError(f"{role}{_unused_role(self.table['framing']['id'])}")
         return self.algorithms[role]
 
     def with_algorithm(self, role: str, algorithm: Any, *, id: str | None = None) -> "Link":
@@ -148,7 +148,7 @@ class Link:
         Args:
             role: The role that it fills.
             algorithm: The algorithm, with its parameters.
-            id: What it is called in the table and in messages; None for the name of its class.
+            id: Its name in the table and in messages; None for the name of its class.
 
         Raises:
             ConfigError: There is no such role, or the pilots have fewer codes than the bar has clusters.
@@ -160,9 +160,9 @@ class Link:
         if role not in ROLES:
             raise ConfigError(f"no role named '{role}'{suggest(role, list(ROLES))}")
         if role != "framing":
-            # Says so where it is no step of the link's framing.
+            # Raises if it is no step of the link's framing.
             self.algorithm(role)
-        parts = self._parts() | {role: algorithm}
+        parts = self._built_sections() | {role: algorithm}
         described = is_dataclass(algorithm) and not isinstance(algorithm, type)
         parameters = asdict(algorithm) if described else {}
         keys = {"id": id or type(algorithm).__name__} | json.loads(json.dumps(parameters, default=str))
@@ -177,16 +177,16 @@ class Link:
                 {name: value for name, value in each.items() if name not in unused}
                 for each in (parts, table, revisions)
             )
-        return _assembled(parts, table, revisions, self.kinds, self.built_in - {role}, self.name)
+        return _assemble_link(parts, table, revisions, self.kinds, self.built_in - {role}, self.name)
 
     def with_air(self, **changes: Any) -> "Link":
-        """The same link with other values on air, e.g. `link.with_air(pilot_every=4)`."""
+        """The same link with other values in `[air]`, e.g. `link.with_air(pilot_every=4)`."""
         air = replace(self.air, **changes)
-        parts, table = self._parts() | {"air": air}, {**self.table, "air": asdict(air)}
-        return _assembled(parts, table, self.revisions, self.kinds, self.built_in, self.name)
+        parts, table = self._built_sections() | {"air": air}, {**self.table, "air": asdict(air)}
+        return _assemble_link(parts, table, self.revisions, self.kinds, self.built_in, self.name)
 
     def block_coder(self) -> BlockCoder:
-        """How packets carry blocks of messages.
+        """The coder of messages' blocks in packets.
 
         Raises:
             ConfigError: A packet is too short for a block.
@@ -194,7 +194,7 @@ class Link:
         code = self.algorithm("error-correction").compile(packet_bits(self.codebook, self.packet))
         return BlockCoder(self.codebook, self.packet, code)
 
-    def _parts(self) -> dict[str, Any]:
+    def _built_sections(self) -> dict[str, Any]:
         return {section: getattr(self, section) for section in _SPECS} | dict(self.algorithms)
 
 
@@ -206,7 +206,7 @@ def load_link(
     Args:
         path: The file; None for all defaults.
         overrides: What `--set` takes, e.g. `"ranging.id=poc"`; the value is TOML, or else plain text.
-        registry: Where algorithms are found; None for all that are installed.
+        registry: The algorithms; None for all that are installed.
 
     Raises:
         ConfigError: The file cannot be read, is not TOML, or does not describe a link.
@@ -218,8 +218,8 @@ def load_link(
     source = ""
     if path is not None:
         source = str(path)
-        table = with_leds(read_toml(path), Path(path).parent, f"{source}: ")
-    set_here = set()
+        table = load_led_file(read_toml(path), Path(path).parent, f"{source}: ")
+    overridden = set()
     for override in overrides:
         section, key, value = _parse_override(override)
         keys = table.setdefault(section, {})
@@ -228,8 +228,8 @@ def load_link(
         keys[key] = value
         if (section, key) == ("bar", "leds_file"):
             keys.pop("leds", None)
-        set_here.add((section, key))
-    link = resolve(table, registry, source=source, overridden=frozenset(set_here))
+        overridden.add((section, key))
+    link = resolve(table, registry, source=source, overridden=frozenset(overridden))
     return replace(link, name=Path(source).stem)
 
 
@@ -244,9 +244,9 @@ def resolve(
 
     Args:
         table: Section to keys, as read from TOML; may be empty.
-        registry: Where algorithms are found; None for all that are installed.
-        source: What faults name as their place, e.g. the file.
-        overridden: (section, key) that came from `--set` instead.
+        registry: The algorithms; None for all that are installed.
+        source: Name of the table in errors, e.g. the file.
+        overridden: Each (section, key) that came from `--set`.
 
     Raises:
         ConfigError: All faults of the table, one line each.
@@ -256,39 +256,39 @@ def resolve(
     8
     """
     registry = Registry.load() if registry is None else registry
-    where_leds = "--set" if ("bar", "leds_file") in overridden else source
-    table = with_leds(table, before=f"{where_leds}: " if where_leds else "")
+    led_source = "--set" if ("bar", "leds_file") in overridden else source
+    table = load_led_file(table, prefix=f"{led_source}: " if led_source else "")
     resolver = _Resolver(table, registry, source, overridden)
     resolver.check_sections()
-    # A framing says which roles there are, and what finds its transmitters.
-    for section in sorted(_KNOWN, key=lambda name: (name in ROLES, name != "framing")):
+    # The framing determines the other roles and the default detection.
+    for section in sorted(_SECTIONS, key=lambda name: (name in ROLES, name != "framing")):
         resolver.resolve_section(section)
     faults = resolver.faults
     if len(faults) == 1 and isinstance(faults[0], UnknownAlgorithmError):
         raise faults[0]
     if faults:
         raise ConfigError("\n".join(str(f) for f in faults))
-    resolved = {section: resolver.resolved[section] for section in _KNOWN if section in resolver.resolved}
-    kinds, built_in = message_kinds(registry), frozenset(resolver.built_in)
-    return _assembled(resolver.built, resolved, resolver.revisions, kinds, built_in)
+    resolved = {section: resolver.resolved[section] for section in _SECTIONS if section in resolver.resolved}
+    kinds, built_in = find_message_kinds(registry), frozenset(resolver.built_in)
+    return _assemble_link(resolver.built, resolved, resolver.revisions, kinds, built_in)
 
 
-_KNOWN = [*_SPECS, *ROLES]
+_SECTIONS = [*_SPECS, *ROLES]
 """Names of a link's tables."""
 
 
 class _Resolver:
-    """Checks the tables of a link one by one, and collects what is wrong with them.
+    """Checks the tables of a link one by one, and collects their faults.
 
     Args:
         table: Section to keys.
-        registry: Where algorithms are found.
-        source: What faults name as their place; empty for none.
-        overridden: (section, key) that came from `--set` instead.
+        registry: The algorithms.
+        source: Name of the table in errors; empty for none.
+        overridden: Each (section, key) that came from `--set`.
 
     Attributes:
-        faults: What is wrong.
-        built: What each section describes.
+        faults: The faults found.
+        built: The object that each section describes.
         resolved: Each section with all its defaults, plain values.
         revisions: Of the algorithms, by role.
         built_in: Roles whose algorithm comes with the SDK.
@@ -303,7 +303,7 @@ class _Resolver:
     ) -> None:
         self._table, self._registry = table, registry
         self._source, self._overridden = source, overridden
-        self._of_chips: frozenset[str] = frozenset()
+        self._unpaired_codes: frozenset[str] = frozenset()
         self.faults: list[str | UnknownAlgorithmError] = []
         self.built: dict[str, Any] = {}
         self.resolved: dict[str, dict[str, Any]] = {}
@@ -311,46 +311,51 @@ class _Resolver:
         self.built_in: set[str] = set()
 
     def check_sections(self) -> None:
-        """Find sections that there are not, or that are no tables."""
+        """Find unknown sections, and those that are not tables."""
         for section, keys in self._table.items():
-            if section not in _KNOWN:
-                self._fault(section, self._key_set(section), f": unknown table{suggest(section, _KNOWN)}")
+            if section not in _SECTIONS:
+                self._add_fault(
+                    section, self._overridden_key(section), f": unknown table{suggest(section, _SECTIONS)}"
+                )
             elif not isinstance(keys, Mapping):
-                self._fault(section, None, f" = {keys!r}: expected a table")
+                self._add_fault(section, None, f" = {keys!r}: expected a table")
 
     def resolve_section(self, section: str) -> None:
-        """Build what a section describes, and write its defaults out."""
+        """Build the object that a section describes, and write its defaults out."""
         keys, framing = self._table.get(section, {}), self.built.get("framing")
         if not isinstance(keys, Mapping):
             return
         if section in STEPS and framing is not None and section not in framing.roles:
             if section in self._table:
-                self._fault(section, self._key_set(section), _unused(self.resolved["framing"]["id"]))
+                self._add_fault(
+                    section, self._overridden_key(section), _unused_role(self.resolved["framing"]["id"])
+                )
             return
         try:
-            plain = self._build(section, dict(keys))
-        except SpecError as refused:
-            for path, text in refused.faults:
-                self._fault(section, path[0], "".join(f".{part}" for part in path[1:]) + text)
-        except ConfigError as refused:
-            self.faults.append(f"{self._source}: {refused}" if self._source else str(refused))
+            plain = self._build_section(section, dict(keys))
+        except SpecError as fault:
+            for path, text in fault.faults:
+                self._add_fault(section, path[0], "".join(f".{part}" for part in path[1:]) + text)
+        except ConfigError as fault:
+            self.faults.append(f"{self._source}: {fault}" if self._source else str(fault))
         else:
             if plain is not None:
                 self.resolved[section] = json.loads(json.dumps(plain))
             if section == "modulation":
-                self._of_chips = _of_chips(self.built)
+                self._unpaired_codes = _known_unpaired_codes(self.built)
 
-    def _build(self, section: str, keys: dict[str, Any]) -> dict[str, Any] | None:
-        """Build what a section describes; give all its keys, None where its algorithm is not known."""
+    def _build_section(self, section: str, keys: dict[str, Any]) -> dict[str, Any] | None:
+        """Build the object that a section describes; return all its keys, None for an unknown algorithm."""
         if section == "bar":
             bar = self.built[section] = BarLayout.of_table(keys)
             return bar.to_table()
         if section in _SPECS:
-            self.built[section] = _built(_SPECS[section], keys, ours=True)
+            # A test checks our own defaults, so that they need no model here.
+            self.built[section] = build_spec(_SPECS[section], keys) if keys else _SPECS[section]()
             return asdict(self.built[section])
-        name = keys.pop("id", self._default_of(section))
+        name = keys.pop("id", self._default_id(section))
         if not isinstance(name, str):
-            self._fault(section, "id", f" = {name!r}: expected a string")
+            self._add_fault(section, "id", f" = {name!r}: expected a string")
             return None
         try:
             installed = self._registry.find(section, name)
@@ -362,64 +367,59 @@ class _Resolver:
         cls, ours = self._registry.load_class(section, name), installed.distribution == "evlcp-sdk"
         if ours:
             self.built_in.add(section)
-        with _named(section, {section: {"id": name}}):
-            self.built[section] = _built(cls, keys, ours=ours)
+        with _name_faults(section, {section: {"id": name}}):
+            self.built[section] = build_spec(cls, keys) if keys or not ours else cls()
             return {"id": name} | asdict(self.built[section])
 
-    def _default_of(self, role: str) -> str:
-        """Id of the algorithm of a role that the table does not name."""
+    def _default_id(self, role: str) -> str:
+        """Id of a role's algorithm that the table does not name."""
         framing = self.built.get("framing")
         if role == "detection" and framing is not None and framing.detection:
             return str(framing.detection)
-        return ROLES[role].default_for(self.built.get("bar"), self._of_chips)
+        return ROLES[role].default_for(self.built.get("bar"), self._unpaired_codes)
 
-    def _key_set(self, section: str) -> str | None:
+    def _overridden_key(self, section: str) -> str | None:
         """The first key of a section that came from `--set`; None for none."""
         keys = self._table[section]
         if not isinstance(keys, Mapping):
             return None
         return next((key for key in keys if (section, key) in self._overridden), None)
 
-    def _fault(self, section: str, key: str | None, text: str) -> None:
+    def _add_fault(self, section: str, key: str | None, text: str) -> None:
         where = "--set" if (section, key) in self._overridden else self._source
         name = section if key is None else f"{section}.{key}"
         self.faults.append(f"{where}: {name}{text}" if where else f"{name}{text}")
 
 
-def _built(cls: type[Any], keys: Mapping[str, Any], *, ours: bool) -> Any:
-    """What a section describes; our own defaults are held by a test, and need no model to be checked."""
-    return build_spec(cls, keys) if keys or not ours else cls()
-
-
-def with_leds(table: Mapping[str, Any], folder: Path = Path(), before: str = "") -> dict[str, Any]:
-    """The same table of a link, the CSV file of LEDs that its `[bar]` names read into it.
+def load_led_file(table: Mapping[str, Any], folder: Path = Path(), prefix: str = "") -> dict[str, Any]:
+    """A copy of a link's table with the LEDs of the CSV file that its `[bar]` names.
 
     Args:
         table: As read from TOML.
-        folder: What the file's name is relative to.
-        before: What stands in front of a fault.
+        folder: Folder of the file.
+        prefix: Beginning of an error's text.
 
     Raises:
-        ConfigError: The file cannot be read, does not describe LEDs, or stands beside LEDs.
+        ConfigError: The file cannot be read or does not describe LEDs, or the table has LEDs, too.
     """
-    found, bar = dict(table), table.get("bar")
+    loaded, bar = dict(table), table.get("bar")
     if not isinstance(bar, Mapping) or "leds_file" not in bar:
-        return found
+        return loaded
     keys = dict(bar)
     name = keys.pop("leds_file")
     if not isinstance(name, str):
-        raise ConfigError(f"{before}bar.leds_file = {format_value(name)}: expected the name of a CSV file")
+        raise ConfigError(f"{prefix}bar.leds_file = {format_value(name)}: expected the name of a CSV file")
     if "leds" in keys:
-        raise ConfigError(f"{before}bar.leds_file = {format_value(name)}: expected it, or bar.leds, not both")
+        raise ConfigError(f"{prefix}bar.leds_file = {format_value(name)}: expected it, or bar.leds, not both")
     try:
         keys["leds"] = read_leds(folder / name)
     except (ConfigError, InputError) as fault:
-        raise ConfigError(f"{before}bar.leds_file: {fault}") from fault
-    found["bar"] = {"shape": "table", **keys}
-    return found
+        raise ConfigError(f"{prefix}bar.leds_file: {fault}") from fault
+    loaded["bar"] = {"shape": "table", **keys}
+    return loaded
 
 
-def _assembled(
+def _assemble_link(
     parts: Mapping[str, Any],
     table: Mapping[str, Mapping[str, Any]],
     revisions: Mapping[str, int],
@@ -427,9 +427,8 @@ def _assembled(
     built_in: frozenset[str],
     name: str = "",
 ) -> Link:
-    """The link of checked parts, and the table that describes them."""
     bar, air = parts["bar"], parts["air"]
-    with _named("framing", table):
+    with _name_faults("framing", table):
         codebook = parts["framing"].codebook(bar.clusters)
         if not isinstance(codebook, Codebook | None):
             raise TypeError(f"gave {type(codebook).__name__} at codebook(), expected a Codebook")
@@ -456,13 +455,12 @@ def _assembled(
 
 
 def _codes_of_roles(parts: Mapping[str, Any], table: Mapping[str, Mapping[str, Any]]) -> Codebook:
-    """The codes that the roles `pilots` and `modulation` give."""
     pilots, modulation, clusters = parts["pilots"], parts["modulation"], parts["bar"].clusters
-    with _named("pilots", table):
+    with _name_faults("pilots", table):
         preamble, codes = pilots.preamble(), pilots.codes(clusters)
         if len(codes) != clusters:
             raise ValueError(f"gave {len(codes)} codes, expected {clusters}")
-    with _named("modulation", table):
+    with _name_faults("modulation", table):
         codewords = modulation.codewords()
     try:
         codebook = Codebook(table["modulation"]["id"], preamble, codes, codewords)
@@ -470,7 +468,7 @@ def _codes_of_roles(parts: Mapping[str, Any], table: Mapping[str, Mapping[str, A
         role = "modulation" if str(fault).startswith("codebook codewords") else "pilots"
         id = table[role]["id"]
         raise ConfigError(add_check_hint(f"{role} algorithm '{id}': {fault}", role, id)) from fault
-    with _named("modulation", table):
+    with _name_faults("modulation", table):
         _check_alphabet(codebook)
     return codebook
 
@@ -480,25 +478,24 @@ def _check_alphabet(codebook: Codebook) -> None:
         raise ValueError("gave 1 codeword, expected two or more")
 
 
-def _unused(framing: str) -> str:
-    """What is said of a role that is no step of a framing."""
+def _unused_role(framing: str) -> str:
     return f": no step of framing '{framing}', which has its own; leave it out"
 
 
-def _of_chips(built: Mapping[str, Any]) -> frozenset[str]:
-    """Which codes are no pair codes, as far as they are known and good."""
+def _known_unpaired_codes(built: Mapping[str, Any]) -> frozenset[str]:
+    """Names of the codes that are not pair codes, as far as they are known and valid."""
     if {"bar", "pilots", "modulation"} <= set(built):
-        # What is wrong with them is said where the codebook is made.
+        # Their faults are reported where the codebook is made.
         with suppress(Exception, SystemExit):
             pilots = built["pilots"]
             codes = pilots.codes(built["bar"].clusters), built["modulation"].codewords()
-            return codes_of_chips(pilots.preamble(), *codes)
+            return find_unpaired_codes(pilots.preamble(), *codes)
     return frozenset()
 
 
 @contextmanager
-def _named(role: str, table: Mapping[str, Mapping[str, Any]]) -> Iterator[None]:
-    """What an algorithm raises within becomes a `PluginError` that names it."""
+def _name_faults(role: str, table: Mapping[str, Mapping[str, Any]]) -> Iterator[None]:
+    """Turn what an algorithm raises within into a `PluginError` that names it."""
     try:
         yield
     except EvlcpError:

@@ -26,7 +26,7 @@ class AirSpec:
 
 @dataclass(frozen=True)
 class MessageSpec:
-    """How messages are read from packets, and whose beacons are believed."""
+    """How messages are read from packets, and whose beacons are verified."""
 
     decode: Annotated[bool, Field(description="Read messages; without, packets are symbols only.")] = True
     combine_packets: Annotated[

@@ -1,4 +1,4 @@
-"""Several links of one receiver: their names, and what they must share."""
+"""Several links of one receiver: their names, and what they must have in common."""
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -19,13 +19,13 @@ def load_links(
     overrides: Sequence[str] = (),
     registry: Registry | None = None,
 ) -> tuple[Link, ...]:
-    """Links, or the files of some, resolved: one of all defaults where none is given.
+    """Load links from files; links that are given are kept, and None is one of all defaults.
 
     Args:
         link: A link, a `link.toml`, or several of these.
-        overrides: `table.key=value` texts that change those that are read from files; of several,
-            `name.table.key=value` changes the one of that name.
-        registry: Where algorithms are found; None for all that are installed.
+        overrides: `table.key=value` texts that change the links from files; `name.table.key=value` changes
+            only the one of that name.
+        registry: The algorithms; None for all that are installed.
 
     Raises:
         ConfigError: A file does not describe a link, or they cannot be received together.
@@ -33,45 +33,42 @@ def load_links(
     given: Sequence[LinkLike] = [link] if link is None or isinstance(link, Link | Path | str) else link
     names = [one.name if isinstance(one, Link) else Path(one).stem if one else "" for one in given]
     links = tuple(
-        one if isinstance(one, Link) else load_link(one, _overrides_of(name, names, overrides), registry)
+        one if isinstance(one, Link) else load_link(one, _select_overrides(name, names, overrides), registry)
         for one, name in zip(given, names, strict=True)
     )
-    named_links(links)
+    name_links(links)
     return links
 
 
-def _overrides_of(name: str, names: Sequence[str], overrides: Sequence[str]) -> list[str]:
-    """The overrides that one of several links takes: those of all links, and those that name it."""
+def _select_overrides(name: str, names: Sequence[str], overrides: Sequence[str]) -> list[str]:
+    """The overrides of one of several links: those of all links, and those with its name."""
     if len(names) == 1:
         return list(overrides)
-    taken = []
+    selected = []
     for text in overrides:
         key = text.partition("=")[0]
         if key.count(".") < 2:
-            taken.append(text)
+            selected.append(text)
             continue
         which = key.partition(".")[0].strip()
         if which not in names:
             raise ConfigError(f"--set {text}: no link is named '{which}': expected one of {', '.join(names)}")
         if which == name:
-            taken.append(text.partition(".")[2])
-    return taken
+            selected.append(text.partition(".")[2])
+    return selected
 
 
-def named_links(link: Link | Sequence[Link]) -> dict[str, Link]:
-    """Links by name: a single one has none, of several one without a name is called by its place.
-
-    Args:
-        link: A link, or several.
+def name_links(link: Link | Sequence[Link]) -> dict[str, Link]:
+    """Links by name: a single one has none; of several, those without a name get one from their index.
 
     Raises:
-        ConfigError: There are none, two have one name, cameras or steps in time differ, or nothing on air
-            tells two of them apart.
+        ConfigError: There are none, two have one name, cameras or time steps differ, or nothing on air
+            distinguishes two of them.
 
     >>> from evlcp_sdk.link.resolve import load_link
-    >>> list(named_links([load_link(), load_link(overrides=["modulation.id=wh8"])]))
+    >>> list(name_links([load_link(), load_link(overrides=["modulation.id=wh8"])]))
     ['link-0', 'link-1']
-    >>> list(named_links(load_link()))
+    >>> list(name_links(load_link()))
     ['']
     """
     given = [link] if isinstance(link, Link) else list(link)
@@ -85,23 +82,23 @@ def named_links(link: Link | Sequence[Link]) -> dict[str, Link]:
         if name in links:
             raise ConfigError(f"two links are named '{name}': expected another name for each file")
         for other_name, other in links.items():
-            _check(other_name, other, name, one)
+            _check_pair(other_name, other, name, one)
         links[name] = one
     return links
 
 
-def placing_links(links: Mapping[str, Link]) -> dict[str, Link]:
-    """The links whose bars positions are computed from: of several, those that show more than one cluster.
+def select_positioning_links(links: Mapping[str, Link]) -> dict[str, Link]:
+    """The links with bars for positions: the only one, or those of more than one cluster.
 
     Args:
-        links: As `named_links` gives them.
+        links: As `name_links` gives them.
 
     Raises:
-        ConfigError: Of several links, none has such bars, or these differ in `[position]`.
+        ConfigError: None of several links has such bars, or these differ in `[position]`.
     """
     if len(links) == 1:
         return dict(links)
-    # What a framing receives by itself has no points in the image.
+    # A framing with its own receiver gives no points in the image.
     bars = {n: one for n, one in links.items() if one.bar.clusters > 1 and "separation" in one.algorithms}
     if not bars:
         raise ConfigError("positions are computed from bars of more than one cluster, and no link has any")
@@ -114,53 +111,52 @@ def placing_links(links: Mapping[str, Link]) -> dict[str, Link]:
     return bars
 
 
-def alike_links(links: Mapping[str, Link]) -> list[tuple[str, str]]:
-    """Pairs of links of which what one sends can be read by the other, so that rows may name the wrong one.
+def find_ambiguous_links(links: Mapping[str, Link]) -> list[tuple[str, str]]:
+    """Pairs of links of which one may decode what the other sends, so that rows may name the wrong one.
 
-    Of framings that read transmitters that rest between characters, whichever way round the light is, with
-    a clock that is known to `Framing.clock_share`: their rates are not further apart than that, and each
-    codeword of one, but for what it rests longer, is one of the other.
+    Their LEDs rest while nothing is sent, their rates differ by no more than `Framing.clock_share`, and each
+    codeword of one, without its longer rest, is a codeword of the other.
 
     Args:
-        links: As `named_links` gives them.
+        links: As `name_links` gives them.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> one_led = ["bar.rows=1", "bar.columns=1", "bar.cluster_rows=1", "bar.cluster_columns=1"]
     >>> lamp = load_link(None, [*one_led, "framing.id=uart"])
     >>> other = load_link(None, [*one_led, "framing.id=uart", "framing.idle=off"])
-    >>> alike_links({"lamp": lamp, "other": other})
+    >>> find_ambiguous_links({"lamp": lamp, "other": other})
     [('lamp', 'other')]
     """
     pairs = []
     for (name, one), (other_name, other) in combinations(links.items(), 2):
-        ours, theirs = _rested(one), _rested(other)
+        ours, theirs = _rest_mask(one), _rest_mask(other)
         if ours is None or theirs is None:
             continue
         share = max(link.algorithm("framing").clock_share for link in (one, other))
         apart = abs(one.air.chip_rate_hz / other.air.chip_rate_hz - 1)
-        if apart <= share and (_within(ours, theirs) or _within(theirs, ours)):
+        if apart <= share and (_is_contained(ours, theirs) or _is_contained(theirs, ours)):
             pairs.append((name, other_name))
     return pairs
 
 
-def _rested(link: Link) -> NDArray[np.bool_] | None:
-    """A link's codewords, true where the light is as at rest; None where it has no rest that is known."""
+def _rest_mask(link: Link) -> NDArray[np.bool_] | None:
+    """A link's codewords, true where LEDs are as at rest; None if it has no such state."""
     framing = link.algorithms.get("framing")
     rest = framing.rest() if framing is not None else None
     return None if rest is None else link.codebook.codewords == rest
 
 
-def _within(words: NDArray[np.bool_], others: NDArray[np.bool_]) -> bool:
-    """Whether all words are among others that are not longer, resting from there on."""
+def _is_contained(words: NDArray[np.bool_], others: NDArray[np.bool_]) -> bool:
+    """Whether all words, cut where they only rest, are among others that are not longer."""
     length = others.shape[1]
     if words.shape[1] < length or not words[:, length:].all():
         return False
-    known = {row.tobytes() for row in others}
-    return all(row.tobytes() in known for row in np.ascontiguousarray(words[:, :length]))
+    other_rows = {row.tobytes() for row in others}
+    return all(row.tobytes() in other_rows for row in np.ascontiguousarray(words[:, :length]))
 
 
-def _check(name: str, one: Link, other_name: str, other: Link) -> None:
-    """Refuse two links that cannot be received together."""
+def _check_pair(name: str, one: Link, other_name: str, other: Link) -> None:
+    """Raise ConfigError if two links cannot be received together."""
     both = f"'{name}' and '{other_name}'"
     for section in ("camera", "camera_sigma"):
         if getattr(one, section) != getattr(other, section):

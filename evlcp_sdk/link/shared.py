@@ -1,4 +1,4 @@
-"""What both ends of a link must share, and where two links do not."""
+"""The differences of two links in what both ends must share."""
 
 import numpy as np
 
@@ -7,54 +7,54 @@ from evlcp_sdk.link.blocks import packet_bits
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.specs import format_value
 
-_MESSAGES_TRIED = 4
+_TEST_MESSAGES = 4
 
 
-def differences(sent: Link, received: Link, *, messages: bool = False) -> tuple[str, ...]:
-    """One text for each thing that both ends must share and do not; none when they fit.
+def find_differences(sent: Link, received: Link, *, messages: bool = False) -> tuple[str, ...]:
+    """One text for each difference in what both ends must share; empty if they fit.
 
-    Chip rate, frames of a packet, pilots, codes, the layout of the clusters. What only one end needs, such as
-    the camera or the decoding, may differ.
+    Chip rate, frames of a packet, pilots, codes and the layout of the clusters count; the camera, the
+    decoding and all else that only one end needs may differ.
 
     Args:
         sent: The link of the transmitter.
         received: The link of the receiver.
-        messages: Messages are sent, so that the error correction counts, too.
+        messages: Whether messages are sent, so that the error correction counts, too.
 
     >>> from evlcp_sdk.link.resolve import resolve
-    >>> differences(resolve({"air": {"chip_rate_hz": 5000.0}}), resolve({}))
+    >>> find_differences(resolve({"air": {"chip_rate_hz": 5000.0}}), resolve({}))
     ('air.chip_rate_hz: sent with 5000.0, received with 10000.0',)
     """
-    found = _keys(sent, received, "air", "chip_rate_hz", "frames_per_packet", "pilot_every")
+    found = _key_differences(sent, received, "air", "chip_rate_hz", "frames_per_packet", "pilot_every")
     if sent.codebook != received.codebook:
-        found += _codes(sent, received)
+        found += _code_differences(sent, received)
     ours, theirs = sent.bar.cluster_centres_m(), received.bar.cluster_centres_m()
     if ours.shape != theirs.shape or not np.allclose(ours, theirs, rtol=1e-6, atol=1e-9):
-        other_shape = _keys(sent, received, "bar", "shape")
-        found += other_shape or _keys(sent, received, "bar", *sent.table["bar"])
-    if messages and not _same_correction(sent, received):
-        found += _section(sent, received, "error-correction")
+        other_shape = _key_differences(sent, received, "bar", "shape")
+        found += other_shape or _key_differences(sent, received, "bar", *sent.table["bar"])
+    if messages and not _has_same_correction(sent, received):
+        found += _role_differences(sent, received, "error-correction")
     return tuple(found)
 
 
-def _codes(sent: Link, received: Link) -> list[str]:
-    """Why the codebooks differ; more clusters of one family show in the layout."""
+def _code_differences(sent: Link, received: Link) -> list[str]:
+    """Roles whose codes differ, but for the number of clusters, which the layout shows."""
     ours, theirs = sent.codebook, received.codebook
-    if framing := _settings(sent, received, "framing"):
+    if framing := _setting_differences(sent, received, "framing"):
         return framing
     both, found = min(ours.clusters, theirs.clusters), []
     if not (
         np.array_equal(ours.preamble, theirs.preamble)
         and np.array_equal(ours.pilots[:both], theirs.pilots[:both])
     ):
-        found += _section(sent, received, "pilots")
+        found += _role_differences(sent, received, "pilots")
     if ours.profile != theirs.profile or not np.array_equal(ours.codewords, theirs.codewords):
-        found += _section(sent, received, "modulation")
+        found += _role_differences(sent, received, "modulation")
     return found
 
 
-def _same_correction(sent: Link, received: Link) -> bool:
-    """Whether both ends make the same coded bits of a message; how they are decoded is the receiver's."""
+def _has_same_correction(sent: Link, received: Link) -> bool:
+    """Whether both ends encode messages alike; the decoding may differ."""
     try:
         ours, theirs = (
             link.algorithm("error-correction").compile(packet_bits(link.codebook, link.packet))
@@ -65,13 +65,13 @@ def _same_correction(sent: Link, received: Link) -> bool:
     if (ours.message_bits, ours.coded_bits) != (theirs.message_bits, theirs.coded_bits):
         return False
     rng = np.random.default_rng(0)
-    tried = (rng.integers(0, 2, ours.message_bits, np.uint8) for _ in range(_MESSAGES_TRIED))
+    tried = (rng.integers(0, 2, ours.message_bits, np.uint8) for _ in range(_TEST_MESSAGES))
     return all(np.array_equal(ours.encode(bits), theirs.encode(bits)) for bits in tried)
 
 
-def _section(sent: Link, received: Link, role: str) -> list[str]:
-    """Why codes of a role differ: by its settings, or although these are the same."""
-    if found := _settings(sent, received, role):
+def _role_differences(sent: Link, received: Link, role: str) -> list[str]:
+    """The settings in which a role differs, or else its revision or codes."""
+    if found := _setting_differences(sent, received, role):
         return found
     role = role if role in sent.table else "framing"
     name, a, b = sent.table[role]["id"], sent.revisions[role], received.revisions[role]
@@ -79,14 +79,15 @@ def _section(sent: Link, received: Link, role: str) -> list[str]:
     return [f"{role}.id = {format_value(name)}: sent with {which}"]
 
 
-def _settings(sent: Link, received: Link, role: str) -> list[str]:
-    """Where the settings of a role differ: its algorithm, or else that one's parameters."""
+def _setting_differences(sent: Link, received: Link, role: str) -> list[str]:
+    """The difference in a role's algorithm, or else in its parameters."""
     if role not in sent.table or role not in received.table:
         return []
-    return _keys(sent, received, role, "id") or _keys(sent, received, role, *sent.table[role])
+    other_id = _key_differences(sent, received, role, "id")
+    return other_id or _key_differences(sent, received, role, *sent.table[role])
 
 
-def _keys(sent: Link, received: Link, section: str, *keys: str) -> list[str]:
+def _key_differences(sent: Link, received: Link, section: str, *keys: str) -> list[str]:
     values = ((key, sent.table[section].get(key), received.table[section].get(key)) for key in keys)
     return [
         f"{section}.{key}: sent with {format_value(a)}, received with {format_value(b)}"

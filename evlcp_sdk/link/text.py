@@ -1,4 +1,4 @@
-"""A link as TOML text that explains itself."""
+"""A link as commented TOML text."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -26,14 +26,11 @@ _UNITS = {
 
 
 def to_toml(link: Link, registry: Registry) -> str:
-    """The resolved configuration as TOML, each key with its meaning, unit, bounds and default.
-
-    Loading the text again gives a link with the same digest.
-    """
-    return "\n".join(_toml_lines(link, registry)).rstrip("\n") + "\n"
+    """The link as TOML, each key with meaning, unit, bounds and default; its digest stays the same."""
+    return "\n".join(_make_lines(link, registry)).rstrip("\n") + "\n"
 
 
-def _toml_lines(link: Link, registry: Registry) -> Iterator[str]:
+def _make_lines(link: Link, registry: Registry) -> Iterator[str]:
     yield "# EVLCP link: what transmitter and receiver agree on, and how the receiver works."
     yield f"# digest {link.digest}"
     yield f"# codebook {link.codebook.digest}"
@@ -51,17 +48,17 @@ def _toml_lines(link: Link, registry: Registry) -> Iterator[str]:
         if "shape" in values:
             yield f'shape = "{values["shape"]}"  # or {", ".join(s for s in SHAPES if s != values["shape"])}'
         if section in ROLES:
-            ids = dict.fromkeys(e.algorithm.id for e in registry.installed(section))
+            ids = dict.fromkeys(e.algorithm.id for e in registry.list_algorithms(section))
             others = [id for id in ids if id != values["id"]]
             yield f'id = "{values["id"]}"' + (f"  # or {', '.join(others)}" if others else "")
         for key, value in values.items():
             if key in schema:
-                yield f"# {_comment(key, schema[key])}"
+                yield f"# {_describe_key(key, schema[key])}"
                 yield f"# {key} =" if value is None else f"{key} = {to_toml_value(value)}"
         yield ""
 
 
-def _comment(key: str, schema: Mapping[str, Any]) -> str:
+def _describe_key(key: str, schema: Mapping[str, Any]) -> str:
     unit = next((unit for end, unit in _UNITS.items() if key.endswith(f"_{end}")), "")
     bounds = [
         f"{sign} {schema[name]}"

@@ -8,7 +8,7 @@ from typing import Any, Final
 from evlcp_sdk.air.blocks import Kind
 from evlcp_sdk.errors import UnpluggedError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.link.several import named_links
+from evlcp_sdk.link.several import name_links
 from evlcp_sdk.live.budget import LEVELS, RANGING_EVERY, Budget, Shedder
 from evlcp_sdk.live.delays import DelayTally
 from evlcp_sdk.live.publisher import Publisher
@@ -96,7 +96,7 @@ class LiveLoop:
     ) -> None:
         self._pulses = pulses
         self._source, self._receiver = source, receiver
-        self._forms = {name: link.packet for name, link in named_links(links).items()}
+        self._forms = {name: link.packet for name, link in name_links(links).items()}
         self._publisher = publisher
         self._budget = Budget() if budget is None else budget
         self._reader = Reader(source)

@@ -30,7 +30,7 @@ class Serializer:
     """Writes what a run finds for browsers, in the thread that asks.
 
     Args:
-        links: The configurations by name, as `named_links` gives them.
+        links: The configurations by name, as `name_links` gives them.
         sites: Where the bars stand, for the map.
     """
 

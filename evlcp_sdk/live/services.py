@@ -53,7 +53,7 @@ def serve(
     Args:
         serving: What.
         publisher: Where results come from; closed in the end.
-        links: The configurations by name, as `named_links` gives them.
+        links: The configurations by name, as `name_links` gives them.
         name: Name of the source.
         sites: Where the bars stand.
         clock_zero: UTC of the camera clock's 0; None if it is not known.

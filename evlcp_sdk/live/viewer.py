@@ -90,7 +90,7 @@ class Viewer(Server):
 
     Args:
         publisher: Where results and pictures come from.
-        links: The configurations by name, as `named_links` gives them.
+        links: The configurations by name, as `name_links` gives them.
         name: Name of the source, for the title.
         sites: Where the bars stand, for the map.
         host: Where to listen: of this machine only, unless it is another address of it.

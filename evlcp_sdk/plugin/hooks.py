@@ -1,6 +1,6 @@
-"""The hooks by which packages join the SDK, and the record that names an algorithm.
+"""The hooks by which packages extend the SDK, and the records of algorithms and output formats.
 
-A package joins by an entry point in the group `evlcp` that names a module with functions marked `@hookimpl`.
+A package registers by an entry point in the group `evlcp`, a module with functions marked `@hookimpl`.
 See `docs/hooks.md` for a complete example of each hook.
 """
 
@@ -29,7 +29,7 @@ hookimpl = pluggy.HookimplMarker(ENTRY_POINT_GROUP)
 
 @dataclass(frozen=True)
 class Algorithm:
-    """Where one algorithm is found, without importing it.
+    """Where one algorithm is, without importing it.
 
     Attributes:
         role: The role it fills, a name of `plugin.roles.ROLES`.
@@ -48,17 +48,17 @@ class Algorithm:
 
 @dataclass(frozen=True)
 class SinkRecord:
-    """Where one output format is found, without importing it.
+    """Where one output format is, without importing it.
 
     Attributes:
-        name: The name by which `evlcp receive --sink` asks for it.
+        name: The name by which `evlcp receive --sink` requests it.
         target: `module:Class` of its sink, a class derived from `results.sink.Sink`.
         files: Names of the files that it may leave in the result's folder.
         summary: One line for help and messages.
-        default: It is written without being asked for.
-        positions: It is written only where positions are computed.
+        default: Whether it is written without a request.
+        positions: Whether it is written only if positions are computed.
         packages: Modules that must be installed for it.
-        extra: What `pip install` brings them.
+        extra: The extra that installs them with `pip install`.
     """
 
     name: str

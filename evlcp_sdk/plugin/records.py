@@ -1,4 +1,4 @@
-"""What plugins bring besides algorithms: output formats by name, kinds of messages by number."""
+"""Records of plugins besides algorithms: output formats by name, kinds of messages by number."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,13 +8,13 @@ from typing import Any
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.hooks import SinkRecord
-from evlcp_sdk.plugin.registry import Owner, Registry, load_target
+from evlcp_sdk.plugin.registry import Owner, Registry, import_class
 from evlcp_sdk.suggestions import suggest
 
 SUMMARY = "summary.json"
-"""What every result has: no sink writes it."""
+"""File of every result that no sink may write."""
 
-_MOST_KIND = 15
+_LARGEST_KIND = 15
 
 
 @dataclass(frozen=True)
@@ -38,30 +38,30 @@ class InstalledSink:
         if missing := [name for name in record.packages if find_spec(name) is None]:
             how = f"the extra: pip install '{record.extra}'" if record.extra else ", ".join(missing)
             raise ConfigError(f"{self} needs {how}, or leave --sink {record.name} out")
-        return load_target(str(self), record.target)
+        return import_class(str(self), record.target)
 
 
-def installed_sinks(registry: Registry) -> dict[str, InstalledSink]:
+def find_sinks(registry: Registry) -> dict[str, InstalledSink]:
     """The output formats by name.
 
-    A plugin with a format that cannot be used, or of a name or a file that another one has, is left out.
+    A plugin whose format is invalid, or has the name or a file of another one, is left out.
     """
     found = registry.collect("evlcp_sinks", SinkRecord, _sink_fault)
     return {record.name: InstalledSink(record, owner) for record, (owner, _) in found}
 
 
 def choose_sinks(registry: Registry, names: Sequence[str], *, positions: bool) -> list[InstalledSink]:
-    """The output formats of a run: the default ones and those asked for.
+    """The output formats of a run: the default ones and those requested.
 
     Args:
         registry: The plugins.
-        names: What is asked for.
-        positions: Positions are computed.
+        names: The requested formats.
+        positions: Whether positions are computed.
 
     Raises:
         ConfigError: There is no such format, or it needs positions and none are computed.
     """
-    sinks = installed_sinks(registry)
+    sinks = find_sinks(registry)
     for name in names:
         if name not in sinks:
             raise ConfigError(f"no sink named '{name}'{suggest(name, sorted(sinks), 'installed')}")
@@ -74,10 +74,10 @@ def choose_sinks(registry: Registry, names: Sequence[str], *, positions: bool) -
     ]
 
 
-def message_kinds(registry: Registry) -> dict[int, MessageKind]:
+def find_message_kinds(registry: Registry) -> dict[int, MessageKind]:
     """The kinds of messages by number.
 
-    A plugin with a kind that cannot be used, or of a number or a name that another one has, is left out.
+    A plugin whose kind is invalid, or has the number or name of another one, is left out.
     """
     own = [(kind, ("evlcp-sdk", "")) for kind in BUILT_IN_KINDS.values()]
     found = registry.collect("evlcp_message_kinds", MessageKind, _kind_fault, own)
@@ -85,7 +85,7 @@ def message_kinds(registry: Registry) -> dict[int, MessageKind]:
 
 
 def _sink_fault(record: SinkRecord, others: Sequence[tuple[SinkRecord, Owner]]) -> str | None:
-    """What is wrong with the record of a sink, or with which of the others it clashes."""
+    """The fault of a sink's record, or its conflict with another one; None if there is none."""
     for key in ("name", "target", "summary"):
         value = getattr(record, key)
         if not (isinstance(value, str) and value):
@@ -107,14 +107,14 @@ def _sink_fault(record: SinkRecord, others: Sequence[tuple[SinkRecord, Owner]]) 
 
 
 def _kind_fault(kind: MessageKind, others: Sequence[tuple[MessageKind, Owner]]) -> str | None:
-    """What is wrong with a kind of messages, or with which of the others it clashes."""
-    # A class that does not set them passes for a kind.
+    """The fault of a kind of messages, or its conflict with another one; None if there is none."""
+    # A class may lack them.
     number, name = getattr(kind, "number", None), getattr(kind, "name", None)
     who = f"message kind {name!r}"
     if not (isinstance(name, str) and name):
         return f"{who}: name = {name!r}, expected text"
-    if not (isinstance(number, int) and 1 <= number <= _MOST_KIND):
-        return f"{who}: number = {number!r}, expected 7 to {_MOST_KIND}"
+    if not (isinstance(number, int) and 1 <= number <= _LARGEST_KIND):
+        return f"{who}: number = {number!r}, expected 7 to {_LARGEST_KIND}"
     if name == "packet":
         return f"{who}: its name is that of a packet's line; choose another"
     for other, (owner, _) in others:

@@ -1,7 +1,7 @@
 """The plugin manager: finds plugins by entry point, and algorithms by (role, id).
 
-A plugin that fails is left out with all its hooks, and shown: as a `PluginWarning` when that is found, by
-`Registry.broken`, and in the message to whoever asks for an algorithm that may be its own. All others go on.
+A plugin that fails is left out with all its hooks and reported: by a `PluginWarning` at once, by
+`Registry.broken`, and in the error for an algorithm that it may have. All others stay.
 """
 
 import importlib
@@ -27,11 +27,11 @@ T = TypeVar("T")
 Owner = tuple[str, str]
 """Name and version of a distribution."""
 FaultOf = Callable[[T, Sequence[tuple[T, Owner]]], str | None]
-"""What is wrong with something beside others, each with its distribution; None where nothing is."""
+"""The fault of an object beside others, each with its distribution; None if it has none."""
 
 
 @dataclass(frozen=True)
-class Installed:
+class InstalledAlgorithm:
     """An algorithm and the distribution that brought it."""
 
     algorithm: Algorithm
@@ -40,14 +40,14 @@ class Installed:
 
 
 @dataclass(frozen=True)
-class Broken:
+class BrokenPlugin:
     """A plugin that is left out.
 
     Attributes:
         plugin: Its name, that of its entry point.
-        distribution: What brought it, with its version.
-        reason: What is wrong, in one line.
-        algorithms: (role, id) of its algorithms, as far as it could be asked.
+        distribution: Its distribution, with the version.
+        reason: Its fault, in one line.
+        algorithms: (role, id) of its algorithms, if it lists them.
     """
 
     plugin: str
@@ -61,51 +61,53 @@ class Broken:
 
 
 @lru_cache(maxsize=1)
-def _found(find: Callable[..., Iterable[EntryPoint]], folders: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """The plugins installed in `folders`, found once: a file of every package is read for them."""
+def _find_entry_points(
+    find: Callable[..., Iterable[EntryPoint]], folders: tuple[str, ...]
+) -> tuple[EntryPoint, ...]:
+    """The plugins installed in `folders`, cached, as finding them reads a file of every package."""
     del folders
     return tuple(find(group=ENTRY_POINT_GROUP))
 
 
 @lru_cache
 def _name_and_version(owner: Distribution) -> tuple[str, str]:
-    """Of a distribution: each parses all its metadata, and one brings many plugins."""
+    """A distribution's name and version, cached, as each parses all its metadata."""
     return owner.name, owner.version
 
 
 class Registry:
-    """The installed plugins; made by `Registry.load()`, passed to whoever needs it.
+    """The installed plugins, as `Registry.load()` finds them.
 
-    Algorithms are collected when the first is asked for.
+    Algorithms are collected at the first request for one.
 
     Args:
         plugins: Objects with hooks, e.g. a probe.
 
     Raises:
-        PluginError: Such an object has a hook that the SDK does not have.
+        PluginError: Such an object has an unknown hook.
     """
 
     def __init__(self, *plugins: object) -> None:
         self._manager = pluggy.PluginManager(ENTRY_POINT_GROUP)
         self._manager.add_hookspecs(hookspecs)
         self._owners: dict[str, Distribution | None] = {}
-        self._broken: list[Broken] = []
-        self._collected: dict[tuple[str, str], list[Installed]] | None = None
+        self._broken: list[BrokenPlugin] = []
+        self._collected: dict[tuple[str, str], list[InstalledAlgorithm]] | None = None
         for plugin in plugins:
-            self._add(plugin)
+            self._add_plugin(plugin)
 
     @classmethod
     def load(cls, *plugins: object) -> "Registry":
-        """Find all installed plugins; `plugins` are objects with hooks to add, e.g. a probe.
+        """Find all installed plugins, and add objects with hooks, e.g. a probe.
 
-        What is installed is read once in a process, and again when `sys.path` has changed.
+        Installed packages are read once in a process, and again when `sys.path` has changed.
 
         Raises:
-            PluginError: Such an object has a hook that the SDK does not have.
+            PluginError: Such an object has an unknown hook.
         """
         registry = cls(*plugins)
-        for entry in _found(entry_points, tuple(sys.path)):
-            registry._load(entry)
+        for entry in _find_entry_points(entry_points, tuple(sys.path)):
+            registry._load_entry_point(entry)
         return registry
 
     @property
@@ -114,34 +116,34 @@ class Registry:
         return self._manager.hook
 
     @property
-    def broken(self) -> tuple[Broken, ...]:
+    def broken(self) -> tuple[BrokenPlugin, ...]:
         """The plugins that are left out: those that failed so far."""
         return tuple(self._broken)
 
-    def plugins(self, hook: str) -> list[str]:
+    def plugins_with_hook(self, hook: str) -> list[str]:
         """Names of the plugins that have a hook."""
         return [impl.plugin_name for impl in getattr(self.hook, hook).get_hookimpls()]
 
-    def ask(self, hook: str, *, only: str | None = None, **given: Any) -> list[tuple[str, Any]]:
-        """Call a hook of every plugin: (name of the plugin, what it gave), what it yielded as a list.
+    def call_hook(self, hook: str, *, only: str | None = None, **arguments: Any) -> list[tuple[str, Any]]:
+        """Call a hook of every plugin; return pairs of its name and answer, an iterator's as a list.
 
         A plugin that fails is left out from then on, with all its hooks.
 
         Args:
             hook: Name of the hook.
-            only: The only plugin to ask; None for all.
-            given: The hook's arguments.
+            only: Name of the only plugin to call; None for all.
+            arguments: The hook's arguments.
         """
         answers = []
         for impl in list(getattr(self.hook, hook).get_hookimpls()):
             if only not in (None, impl.plugin_name):
                 continue
             try:
-                answer = impl.function(*(given[name] for name in impl.argnames))
+                answer = impl.function(*(arguments[name] for name in impl.argnames))
                 if isinstance(answer, Iterator):
                     answer = list(answer)
             except (Exception, SystemExit) as fault:
-                self.leave_out(impl.plugin_name, f"{hook}() fails: {_line(fault)}")
+                self.leave_out(impl.plugin_name, f"{hook}() fails: {_describe_fault(fault)}")
                 continue
             answers.append((impl.plugin_name, answer))
         return answers
@@ -149,18 +151,18 @@ class Registry:
     def collect(
         self, hook: str, wanted: type[Any], fault_of: FaultOf[T], own: Sequence[tuple[T, Owner]] = ()
     ) -> list[tuple[T, Owner]]:
-        """What plugins give at a hook, each with its distribution, behind what is there already.
+        """The objects from all plugins' hook, each with its distribution, after those that exist already.
 
-        The SDK's come first: where two clash, the other one's plugin is left out, with all that it gives.
+        The SDK's come first: if two clash, the other one's plugin is left out, with all its objects.
 
         Args:
             hook: The hook.
-            wanted: What they are to give.
-            fault_of: What is wrong with one beside those before it; None where nothing is.
-            own: What is there already.
+            wanted: Type of the objects.
+            fault_of: Gives the fault of an object beside those before it; None if it has none.
+            own: Objects that exist already.
         """
         found = list(own)
-        answers = [(*answer, self.owner(answer[0])) for answer in self.ask(hook)]
+        answers = [(*answer, self.distribution_of(answer[0])) for answer in self.call_hook(hook)]
         for plugin, given, owner in sorted(answers, key=lambda answer: answer[2][0] != "evlcp-sdk"):
             more, fault = list(found), None
             if not (isinstance(given, list | tuple) and all(isinstance(one, wanted) for one in given)):
@@ -175,16 +177,16 @@ class Registry:
         return found
 
     @contextmanager
-    def joined(self, *plugins: object) -> Iterator[None]:
-        """Have objects with hooks join for a while, e.g. a run's sinks that watch the receiver.
+    def add_temporarily(self, *plugins: object) -> Iterator[None]:
+        """Add objects with hooks in a `with` block, e.g. a run's sinks that watch the receiver.
 
         Raises:
-            PluginError: One has a hook that the SDK does not have.
+            PluginError: One has an unknown hook.
         """
         names: list[str] = []
         try:
             for plugin in plugins:
-                names.append(self._add(plugin))
+                names.append(self._add_plugin(plugin))
             yield
         finally:
             for name in names:
@@ -196,25 +198,24 @@ class Registry:
         """Leave out a plugin whose answer to a hook cannot be used.
 
         Args:
-            plugin: Its name, as `ask` gave it.
-            reason: What is wrong, in one line.
+            plugin: Its name, as from `call_hook`.
+            reason: Its fault, in one line.
         """
-        found = self._manager.unregister(name=plugin)
-        self._note(plugin, reason, _known(found))
+        self._record_broken(plugin, reason, _algorithms_of(self._manager.unregister(name=plugin)))
 
-    def installed(self, role: str | None = None) -> list[Installed]:
-        """The algorithms, by role and id; of one role if given. Two of one role and id are both there."""
-        found = sorted(self._algorithms().items())
+    def list_algorithms(self, role: str | None = None) -> list[InstalledAlgorithm]:
+        """The algorithms of all roles or of one, sorted by role and id; duplicates are listed, too."""
+        found = sorted(self._collect_algorithms().items())
         return [entry for (r, _), entries in found if role in (None, r) for entry in entries]
 
-    def find(self, role: str, id: str) -> Installed:
+    def find(self, role: str, id: str) -> InstalledAlgorithm:
         """The algorithm of a role and id.
 
         Raises:
             UnknownAlgorithmError: None is installed; the message suggests the nearest name.
-            PluginError: Two are, or it is one of a broken plugin.
+            PluginError: Two are, or its plugin is broken.
         """
-        entries = self._algorithms().get((role, id), [])
+        entries = self._collect_algorithms().get((role, id), [])
         if len(entries) == 1:
             return entries[0]
         if entries:
@@ -223,7 +224,7 @@ class Registry:
         for broken in self._broken:
             if (role, id) in broken.algorithms:
                 raise PluginError(f"{role} algorithm '{id}': {broken}")
-        names = [e.algorithm.id for e in self.installed(role)]
+        names = [e.algorithm.id for e in self.list_algorithms(role)]
         lost = "".join(f"; {broken}" for broken in self._broken if not broken.algorithms)
         raise UnknownAlgorithmError(
             f"no {role} algorithm named '{id}'{suggest(id, names, 'installed')}{lost}"
@@ -239,26 +240,26 @@ class Registry:
         return load_class(self.find(role, id))
 
     def versions(self) -> dict[str, str]:
-        """Versions of Python, the SDK, what it computes with, and all distributions that bring algorithms."""
+        """Versions of Python, the SDK, its numerical packages, and all distributions with algorithms."""
         found = {"python": platform.python_version()}
         found |= {name: version(name) for name in ("evlcp-sdk", "numpy", "scipy", "numba")}
-        found |= {entry.distribution: entry.version for entry in self.installed()}
+        found |= {entry.distribution: entry.version for entry in self.list_algorithms()}
         return found
 
-    def owner(self, plugin: str) -> tuple[str, str]:
-        """Name and version of the distribution that brought a plugin; of one without, its name and "-"."""
+    def distribution_of(self, plugin: str) -> tuple[str, str]:
+        """Name and version of a plugin's distribution; for one without, its name and "-"."""
         found = self._owners.get(plugin)
         return (plugin, "-") if found is None else _name_and_version(found)
 
-    def _add(self, plugin: object) -> str:
-        """Have an object with hooks join; the name that it has from then on."""
+    def _add_plugin(self, plugin: object) -> str:
+        """Register an object with hooks; return the name that it gets."""
         kind = getattr(plugin, "__name__", type(plugin).__name__)
         name = f"{kind}-{id(plugin):x}"
-        if (fault := self._join(plugin, name, None)) is not None:
+        if (fault := self._register(plugin, name, None)) is not None:
             raise PluginError(f"plugin {kind}: {fault}")
         return name
 
-    def _load(self, entry: EntryPoint) -> None:
+    def _load_entry_point(self, entry: EntryPoint) -> None:
         name = entry.name
         if name in self._owners:
             # Another distribution's entry point has the same name.
@@ -267,19 +268,19 @@ class Registry:
             plugin = entry.load()
         except (Exception, SystemExit) as fault:
             self._owners[name] = entry.dist
-            self._note(name, f"cannot be imported: {_line(fault)}", frozenset())
+            self._record_broken(name, f"cannot be imported: {_describe_fault(fault)}", frozenset())
             return
-        fault_text = self._join(plugin, name, entry.dist)
+        fault_text = self._register(plugin, name, entry.dist)
         if fault_text is not None:
-            self._note(name, fault_text, _known(plugin))
+            self._record_broken(name, fault_text, _algorithms_of(plugin))
 
-    def _join(self, plugin: object, name: str, owner: Distribution | None) -> str | None:
-        """Register a plugin; what is wrong with its hooks, if anything is."""
+    def _register(self, plugin: object, name: str, owner: Distribution | None) -> str | None:
+        """Register a plugin; return the fault of its hooks, if any."""
         self._owners[name] = owner
         try:
             self._manager.register(plugin, name=name)
         except pluggy.PluginValidationError as fault:
-            # Those of its hooks that came before the wrong one are in.
+            # Its hooks before the wrong one are registered.
             self._manager.unregister(name=name)
             return " ".join(str(fault.args[0]).split())
         except ValueError:
@@ -290,68 +291,70 @@ class Registry:
                 return f"has the hook '{hook.name}', which this SDK does not have"
         return None
 
-    def _note(self, name: str, reason: str, algorithms: frozenset[tuple[str, str]]) -> None:
+    def _record_broken(self, name: str, reason: str, algorithms: frozenset[tuple[str, str]]) -> None:
         owner = self._owners.get(name)
         distribution = "" if owner is None else " ".join(_name_and_version(owner))
-        broken = Broken(name, distribution, reason, algorithms)
+        broken = BrokenPlugin(name, distribution, reason, algorithms)
         self._broken.append(broken)
         # Not imported at start-up, as it takes long and is needed only here.
         import multiprocessing
 
-        # Worker processes would only say it again.
+        # Worker processes would only repeat it.
         if multiprocessing.parent_process() is None:
             warnings.warn(str(broken), PluginWarning, stacklevel=2)
 
-    def _algorithms(self) -> dict[tuple[str, str], list[Installed]]:
+    def _collect_algorithms(self) -> dict[tuple[str, str], list[InstalledAlgorithm]]:
         if self._collected is None:
             self._collected = {}
             for record, owner in self.collect("evlcp_algorithms", Algorithm, _algorithm_fault):
-                self._collected.setdefault((record.role, record.id), []).append(Installed(record, *owner))
+                self._collected.setdefault((record.role, record.id), []).append(
+                    InstalledAlgorithm(record, *owner)
+                )
         return self._collected
 
 
-def load_class(one: Installed) -> type[Any]:
+def load_class(installed: InstalledAlgorithm) -> type[Any]:
     """Import the class of an algorithm.
 
     Raises:
         PluginError: Its target cannot be imported, or does not fill the role.
     """
-    role = one.algorithm.role
-    who = f"{role} algorithm '{one.algorithm.id}' of {one.distribution}"
-    return load_target(who, one.algorithm.target, ROLES[role].abstract)
+    role = installed.algorithm.role
+    who = f"{role} algorithm '{installed.algorithm.id}' of {installed.distribution}"
+    return import_class(who, installed.algorithm.target, ROLES[role].abstract)
 
 
-def load_target(who: str, target: str, kind: type[Any] = object) -> type[Any]:
-    """Import the class that a record names as `module:Class`, of a kind.
+def import_class(who: str, target: str, kind: type[Any] = object) -> type[Any]:
+    """Import the class `module:Class`, a subclass of `kind`.
 
     Raises:
-        PluginError: It cannot be imported, or is none; the message begins with who has it.
+        PluginError: It cannot be imported, or is no such class; the message begins with `who`.
     """
     module, _, name = target.partition(":")
     try:
         found: type[Any] = getattr(importlib.import_module(module), name)
     except (Exception, SystemExit) as fault:
-        raise PluginError(f"{who}: cannot import {target}: {_line(fault)}") from fault
+        raise PluginError(f"{who}: cannot import {target}: {_describe_fault(fault)}") from fault
     if not (isinstance(found, type) and issubclass(found, kind)):
         raise PluginError(f"{who}: {target} is not a {'class' if kind is object else kind.__name__}")
     return found
 
 
-def _line(fault: BaseException) -> str:
+def _describe_fault(fault: BaseException) -> str:
     """An exception in one line."""
     text = " ".join(str(fault).split())
     return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
 
 
 def _algorithm_fault(record: Algorithm, _others: object) -> str | None:
-    """What is wrong with an algorithm that a plugin brings."""
+    """The fault of a plugin's algorithm, if any."""
     if record.role in ROLES:
         return None
     return f"algorithm '{record.id}' has role '{record.role}', expected one of {', '.join(ROLES)}"
 
 
-def _known(plugin: Any) -> frozenset[tuple[str, str]]:
-    """The algorithms of a broken plugin, as far as it can be asked."""
+def _algorithms_of(plugin: Any) -> frozenset[tuple[str, str]]:
+    """(role, id) of a broken plugin's algorithms, if it lists them."""
     try:
         records = list(plugin.evlcp_algorithms())
     except Exception:

@@ -71,16 +71,16 @@ class Detector(Protocol):
         """State before the first event."""
 
     def step(self, state: Any, start_us: int, events: Events) -> tuple[Any, list[Region]]:
-        """Take the events of a time step; give where transmitters are at its end.
+        """Take the events of a time step; return the regions of transmitters at its end.
 
         Args:
-            state: What `init` or the last `step` gave; not changed.
+            state: From `init` or the last `step`; not changed.
             start_us: Start of the step, us; steps without events are left out while there is no region.
             events: Those of the whole image.
 
         Returns:
             The new state, and a region for each transmitter, with the same `id` as long as it is the same;
-            one that is not given any more has ended.
+            a region that is missing has ended.
         """
 
 
@@ -88,7 +88,7 @@ class Detection(ABC):
     """Events of the image to regions that blink, followed.
 
     Attributes:
-        rhythmic: The receiver itself follows what blinks in the rhythm of the chips; nothing is compiled.
+        rhythmic: Whether the receiver itself follows what blinks at the chip rate; then nothing is compiled.
     """
 
     rhythmic: ClassVar[bool] = False
@@ -105,33 +105,34 @@ class Deframer(Protocol):
         """State before a region's first event."""
 
     def step(self, state: Any, events: Events, until_us: int) -> tuple[Any, list[DecodedFrame]]:
-        """Take a region's events up to `until_us`; give the frames that are certain by then, in order.
+        """Take a region's events up to `until_us`; return the frames that are certain by then, in order.
 
         Args:
-            state: What `init` or the last `step` gave; not changed.
+            state: From `init` or the last `step`; not changed.
             events: Those of the region, in order.
             until_us: All events before this time have been given.
         """
 
     def close(self, state: Any) -> tuple[Any, list[DecodedFrame]]:
-        """End the region: give the new state and the frames that are left."""
+        """End the region; return the new state and the remaining frames."""
 
     def counts(self, state: Any) -> Mapping[str, int]:
-        """What was found and doubted so far, by name."""
+        """Counts of what was found and rejected so far, by name."""
 
 
 class Framing(ABC):
-    """What a packet is on air, and a region's events to packets.
+    """The chips of a packet on air, and a region's events to packets.
 
     A packet is a preamble and frames; a frame is a pilot and a codeword of each cluster. Any of these codes
     may have any length, the pilots none at all.
 
     Attributes:
-        roles: The roles that do its steps; a link has tables of these only, of those in `STEPS`. Where it is
-            all of these, the receiver reads packets by them, and the framing itself is not compiled.
+        roles: The roles that do its steps; of those in `STEPS` a link has tables of these only. If it has all
+            of them, the receiver reads packets by them, and the framing itself is not compiled.
         detection: Id of the detection of a link that names none; empty for the role's default.
-        characters_on_air: A symbol is the code of a character, so that packets without a block say a text.
-        clock_share: Share by which a transmitter's clock may be off and still be read; 0: not said.
+        characters_on_air: Whether a symbol is the code of a character, so that packets without a block are
+            text.
+        clock_share: Largest share by which a transmitter's clock may be off and still be read; 0: unknown.
     """
 
     roles: ClassVar[frozenset[str]] = frozenset()
@@ -141,7 +142,7 @@ class Framing(ABC):
 
     @abstractmethod
     def codebook(self, clusters: int) -> Codebook | None:
-        """The codes on air; None where the roles `pilots` and `modulation` give them.
+        """The codes on air; None if the roles `pilots` and `modulation` give them.
 
         Raises:
             ConfigError: It has no codes for so many clusters.
@@ -152,20 +153,20 @@ class Framing(ABC):
         """Precompute for codes and a packet format."""
 
     def infer(self, events: Events) -> tuple[Mapping[str, Any], str]:
-        """What a link has to say to read a light of which nothing is known: `table.key` to value, and why.
+        """The link settings that read an unknown light, `table.key` to value, and the reason.
 
-        Nothing where it is no light of this framing, with what it looks like at best; nothing and no words
-        where a framing does not look.
+        No settings if it is no light of this framing, with its best description; no settings and no reason if
+        the framing cannot tell.
         """
         return {}, ""
 
     def rest(self) -> int | None:
-        """What LEDs must do while nothing is sent, 1 on, 0 off; None where any pattern may stand there."""
+        """State of the LEDs while nothing is sent, 1 on, 0 off; None if any pattern may be shown."""
         return None
 
 
 class Pilots(ABC):
-    """Codes that find time and tell clusters apart."""
+    """Codes that find time and identify clusters."""
 
     @abstractmethod
     def preamble(self) -> NDArray[np.uint8]:
@@ -187,7 +188,7 @@ class Modulation(ABC):
     def codewords(self) -> NDArray[np.uint8]:
         """One codeword a symbol, chips, uint8 (S, M).
 
-        With m the whole part of log2 S, row s < 2**m carries the m bits of s, msb first; rows beyond are
+        With m the integer part of log2 S, row s < 2**m carries the m bits of s, msb first; further rows are
         symbols that messages do not use.
         """
 
@@ -201,10 +202,10 @@ class Synchronizer(Protocol):
     def step(
         self, state: Any, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: int
     ) -> tuple[Any, list[SyncLock]]:
-        """Take a region's events up to `until_us`; give one lock for each packet whose preamble was detected.
+        """Take a region's events up to `until_us`; return one lock for each packet with a detected preamble.
 
         Args:
-            state: What `init` or the last `step` gave; not changed.
+            state: From `init` or the last `step`; not changed.
             t_us: Event times, ascending, int64 (n,).
             p: Polarities, uint8 (n,).
             until_us: All events before this time have been given.
@@ -239,7 +240,7 @@ class Ranging(ABC):
     """A decoded frame's image to distance.
 
     Attributes:
-        measures: Whether it gives distances at all.
+        measures: Whether it measures distances at all.
     """
 
     measures: ClassVar[bool] = True
@@ -262,15 +263,15 @@ class Filter(ABC):
 
     @abstractmethod
     def predict(self, state: Any, t_us: float) -> tuple[NDArray[np.float64], float] | None:
-        """Values float64 (n,) and sigma expected at a time; None before the first measurement."""
+        """Expected values, float64 (n,), and sigma at a time; None before the first measurement."""
 
     @abstractmethod
     def step(
         self, state: Any, t_us: float, value: NDArray[np.float64], sigma: float
     ) -> tuple[Any, NDArray[np.float64], float]:
-        """Take a measurement, float64 (n,); give the new state, the filtered values and their sigma.
+        """Take a measurement, float64 (n,); return the new state, the filtered values and their sigma.
 
-        The state that is given is not changed.
+        The given state is not changed.
         """
 
 
@@ -297,12 +298,12 @@ class Tracking(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """A block as the code understands it.
+    """A decoded block.
 
     Attributes:
-        bits: Message bits, uint8 (message_bits,); the best guess where the check fails.
-        ok: The check against undetected errors holds.
-        flipped: Received bits (the signs of the LLRs) that differ from the coded bits decided for.
+        bits: Message bits, uint8 (message_bits,); the best guess if the check fails.
+        ok: Whether the check against undetected errors passes.
+        flipped: Number of received bits (the signs of the LLRs) that differ from the decoded block's.
     """
 
     bits: NDArray[np.uint8]
@@ -315,7 +316,7 @@ class Code(Protocol):
 
     @property
     def message_bits(self) -> int:
-        """Bits of a message that a block carries."""
+        """Message bits of a block."""
 
     @property
     def coded_bits(self) -> int:
@@ -355,53 +356,51 @@ class Role:
     Attributes:
         name: The table that selects the algorithm in `link.toml`.
         abstract: The class that its algorithms derive from.
-        default: Id of the algorithm where the link names none.
+        default: Id of the algorithm if the link names none.
         verb: What it does, in one line.
-        default_of_chips: Id of it for codes that are not pair codes, which the default refuses; None where
-            that one takes all codes.
-        by_layout: Id of it for a known bar, and which of its codes are no pair codes, in place of both; None
-            where that does not depend on the bar.
+        default_unpaired: Id of the default for codes that are not pair codes; None if `default` takes them.
+        by_layout: Gives the default for a bar and the names of its codes that are not pair codes; None if it
+            does not depend on the bar.
     """
 
     name: str
     abstract: type[ABC]
     default: str
     verb: str
-    default_of_chips: str | None = None
+    default_unpaired: str | None = None
     by_layout: Callable[[BarLayout, Collection[str]], str] | None = None
 
-    def default_for(self, bar: BarLayout | None, of_chips: Collection[str] = ()) -> str:
-        """Id of the algorithm where the link names none, for its bar; None for one that is not known.
+    def default_for(self, bar: BarLayout | None, unpaired_codes: Collection[str] = ()) -> str:
+        """Id of the algorithm if the link names none.
 
         Args:
-            bar: The link's.
-            of_chips: Which of its codes are no pair codes, see `Codebook.of_chips`.
+            bar: The link's bar; None if unknown.
+            unpaired_codes: Names of its codes that are not pair codes, see `Codebook.unpaired_codes`.
 
         >>> from evlcp_sdk.scene.bar import BarLayout, LedGrid
         >>> [ROLES["ranging"].default_for(BarLayout(LedGrid(96, columns))) for columns in (1, 2)]
         ['joint-scale', 'joint-scale']
         """
         if bar is not None and self.by_layout is not None:
-            return self.by_layout(bar, of_chips)
-        return self.default_of_chips if of_chips and self.default_of_chips is not None else self.default
+            return self.by_layout(bar, unpaired_codes)
+        return self.default_unpaired if unpaired_codes and self.default_unpaired is not None else self.default
 
 
-_WIDEST = 2.0
-"""Widths of a layout, in heights of its columns, up to which these tell the distance better."""
+_MOST_RELATIVE_WIDTH = 2.0
+"""Widest layout, in heights of its columns, whose columns measure the distance better than its width."""
 
 
-def _ranging_of(bar: BarLayout, of_chips: Collection[str]) -> str:
-    """Id of the ranging that fits a layout best."""
+def _choose_ranging(bar: BarLayout, unpaired_codes: Collection[str]) -> str:
     if not bar.has_distinct_centres:
         return "none"
-    # From side to side `joint-scale` measures nothing: of low columns far apart, that is what counts.
+    # `joint-scale` ignores the width, which matters most for low columns far apart.
     high_m = max((len(clusters) * pitch_m for clusters, pitch_m in bar.even_columns), default=0.0)
-    if "pilots" not in of_chips and high_m > 0 and bar.width_m <= _WIDEST * high_m:
+    if "pilots" not in unpaired_codes and high_m > 0 and bar.width_m <= _MOST_RELATIVE_WIDTH * high_m:
         return "joint-scale"
-    alike_sides = int(bar.has_usual_sides.sum())
-    if alike_sides >= 2 and bar.has_equal_clusters:
+    usual = int(bar.has_usual_sides.sum())
+    if usual >= 2 and bar.has_equal_clusters:
         return "poc"
-    return "centroid" if alike_sides >= 3 else "none"
+    return "centroid" if usual >= 3 else "none"
 
 
 ROLES: Mapping[str, Role] = MappingProxyType(
@@ -426,7 +425,7 @@ ROLES: Mapping[str, Role] = MappingProxyType(
                 Ranging,
                 "joint-scale",
                 "a decoded frame's image -> distance",
-                by_layout=_ranging_of,
+                by_layout=_choose_ranging,
             ),
             Role("tracking", Tracking, "none", "distance and image position over time"),
             Role("error-correction", ErrorCorrection, "polar", "message bits <-> coded bits, soft input"),

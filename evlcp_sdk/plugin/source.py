@@ -1,4 +1,4 @@
-"""What every recording, camera and replay is to a receiver: a stream of events, with what it lost."""
+"""Event sources, such as recordings, cameras and replays: streams of events with their losses."""
 
 import traceback
 from abc import ABC, abstractmethod
@@ -12,17 +12,17 @@ from evlcp_sdk.errors import EvlcpError, PluginError, StreamError
 from evlcp_sdk.values import Events, Triggers
 
 DEFAULT_MAX_EVENTS = 1 << 18
-"""Events of a piece unless asked otherwise: under 4 MB, so that it is still in the cache when it is used, and
-four times what four bars give in a time step, as a step that lies in two pieces has to be put together."""
+"""Default number of events in a piece: under 4 MB, so that it stays in the cache until it is used, and four
+times a time step's events of four bars, as a step in two pieces has to be joined."""
 
 
 @dataclass(frozen=True)
 class Loss:
-    """One kind of data that a source had to skip, drop or doubt.
+    """Data of one kind that a source skipped, dropped or found suspect.
 
     Attributes:
-        count: How many.
-        first: Where the first was: a byte offset, a line or a row (both from 1), as `unit` says.
+        count: Number of items.
+        first: Place of the first one in `unit`: a byte offset, a line or a row (both from 1).
         unit: `byte`, `line` or `row`.
         meaning: What was lost, for a reader of the summary.
 
@@ -36,15 +36,15 @@ class Loss:
     meaning: str
 
     @staticmethod
-    def added(before: "Mapping[str, Loss]", after: "Mapping[str, Loss]") -> "dict[str, Loss]":
-        """Losses of two parts of a stream together; the first place is the earlier part's."""
+    def merge(before: "Mapping[str, Loss]", after: "Mapping[str, Loss]") -> "dict[str, Loss]":
+        """Losses of two parts of a stream together, by kind; the first place is the earlier part's."""
         out = dict(before)
         for kind, loss in after.items():
             out[kind] = replace(out[kind], count=out[kind].count + loss.count) if kind in out else loss
         return out
 
-    def more(self, count: int, first: int) -> "Loss":
-        """So many more, the first of which was there."""
+    def add(self, count: int, first: int) -> "Loss":
+        """The loss with `count` items more, of which the first is at `first`."""
         return replace(self, count=self.count + count, first=self.first if self.count else first)
 
     def __str__(self) -> str:
@@ -52,47 +52,47 @@ class Loss:
 
 
 class Ledger(Protocol):
-    """What decodes or checks a source's events, and counts what it drops."""
+    """A decoder or checker of a source's events that counts what it drops."""
 
     @property
     def losses(self) -> dict[str, Loss]:
-        """What has been lost so far, by kind."""
+        """The losses so far, by kind."""
 
     @property
     def counts(self) -> dict[str, int]:
-        """What else it counts, by name."""
+        """Its other counts, by name."""
 
 
 class EventSource(ABC):
     """A recording or a camera, read once from front to back; a context manager.
 
-    An event or trigger earlier than the one before is dropped and counted as the loss `time_backward`, one at
-    a time that no others agree with as `time_doubtful`. Time runs backward in what a source gives out only
-    where a camera's clock has restarted, as some events on end agree; a receiver judges by the same rule.
+    An event or trigger earlier than the one before is dropped and counted as the loss `time_backward`, one
+    whose time no others confirm as `time_doubtful`. Times go backward only where the camera's clock has
+    restarted, which several events in a row confirm; a receiver applies the same rule.
 
     A source of your own calls `super().__init__` and implements `take` and `close`.
 
     Args:
-        path: The file, or a name for what is not one.
+        path: The file, or the name of another source.
         format: `EVT3`, `EVT2`, `NPZ`, `CSV` or another format's name.
-        width: Columns of the sensor, or None where the recording does not say.
+        width: Columns of the sensor, or None if unknown.
         height: Rows of the sensor, or None.
         header: The recording's own header lines, by key.
         size_bytes: Size of the file, or None for a live source.
-        ledger: Whose losses and counts are this source's; None where nothing is ever lost.
+        ledger: Has this source's losses and counts; None if nothing is ever lost.
     """
 
     live = False
-    """Whether its time goes on by itself, as a camera's: what is not taken soon is late."""
+    """Whether its time goes on by itself, as a camera's, so that events not taken soon are late."""
 
     guessed = ""
-    """What the recording does not say and was guessed, in words; empty for nothing."""
+    """Properties of the recording that were guessed, in words; empty for none."""
 
     step_us = 0
-    """What all times are seen to be multiples of, us; 0 where nobody looked."""
+    """Step of which all times are multiples, us; 0 if unknown."""
 
     _gives_bits = False
-    """Whether a polarity is a single bit of what it reads, so that none can be wrong."""
+    """Whether polarities are single bits in the recording, so that none can be invalid."""
 
     def __init__(
         self,
@@ -112,13 +112,13 @@ class EventSource(ABC):
         self.size_bytes = size_bytes
         self._ledger = ledger
         self._given = {"events": 0, "triggers": 0}
-        self._rest = (Events.empty(), Triggers.empty())
+        self._pending = (Events.empty(), Triggers.empty())
 
     @abstractmethod
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         """Return the next piece, of about `max_events` events, or None at the end; a camera waits for it.
 
-        The columns are the caller's: nothing overwrites them.
+        The columns belong to the caller: nothing overwrites them.
 
         Raises:
             InputError: The file cannot be read on.
@@ -130,76 +130,76 @@ class EventSource(ABC):
 
     @property
     def position_bytes(self) -> int:
-        """How much of `size_bytes` is done; 0 for a live source."""
+        """Bytes read, of `size_bytes`; 0 for a live source."""
         return 0
 
     def clock_s(self, t_us: float) -> float | None:
-        """When a time of the camera's clock was, by `time.monotonic()`, s; None if it is not known."""
+        """The `time.monotonic()` at a time of the camera's clock, s; None if unknown."""
         return None
 
     @property
     def health(self) -> Mapping[str, float | int | str]:
-        """What a camera says of itself, such as `temperature_c`, by name; nothing of most sources."""
+        """A camera's own measurements, such as `temperature_c`, by name; empty for most sources."""
         return {}
 
     @property
     def losses(self) -> dict[str, Loss]:
-        """What has been lost so far, by kind; a kind that did not occur is left out."""
+        """The losses so far, by kind, for kinds that occurred."""
         return {} if self._ledger is None else self._ledger.losses
 
     @property
     def counts(self) -> dict[str, int]:
-        """What has been given out so far, `events` and `triggers`, and what else the format counts."""
+        """`events` and `triggers` given out so far, and the format's other counts."""
         return self._given | ({} if self._ledger is None else self._ledger.counts)
 
     def stream(self, max_events: int = DEFAULT_MAX_EVENTS) -> Iterator[tuple[Events, Triggers]]:
-        """Yield what follows, in pieces of at most `max_events` events and as many triggers.
+        """Yield the following events and triggers, in pieces of at most `max_events` of each.
 
         A piece belongs to the caller: nothing overwrites it. A second call goes on where the first one
         stopped. Either half of a pair may be empty, not both.
 
         Raises:
             InputError: The file cannot be read on.
-            PluginError: A plugin's source fails, or gives something else than `take` says.
+            PluginError: A plugin's source fails, or breaks the contract of `take`.
             StreamError: `max_events` is not positive.
         """
         if max_events < 1:
             raise StreamError(f"max_events is {max_events}, expected 1 or more")
         nothing = Events.empty(), Triggers.empty()
         while True:
-            events, triggers = self._rest
+            events, triggers = self._pending
             if not len(events) and not len(triggers):
-                piece = self._taken(max_events)
+                piece = self._take_checked(max_events)
                 if piece is None:
                     return
-                self._rest = piece
+                self._pending = piece
                 continue
             if len(events) <= max_events and len(triggers) <= max_events:
-                self._rest = nothing
+                self._pending = nothing
             else:
-                self._rest = events[max_events:], triggers[max_events:]
+                self._pending = events[max_events:], triggers[max_events:]
                 events, triggers = events[:max_events], triggers[:max_events]
             self._given["events"] += len(events)
             self._given["triggers"] += len(triggers)
             yield events, triggers
 
-    def _taken(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """What `take` gives, checked: kernels trust it."""
-        with self._guarded():
+    def _take_checked(self, max_events: int) -> tuple[Events, Triggers] | None:
+        """The piece from `take`, checked, as kernels rely on it."""
+        with self._wrap_faults():
             piece: object = self.take(max_events)
         if piece is None:
             return None
         if not isinstance(piece, tuple) or tuple(map(type, piece)) != (Events, Triggers):
             gave = ", ".join(type(one).__name__ for one in piece) if isinstance(piece, tuple) else None
-            raise self._refused(f"gave ({gave or type(piece).__name__}), expected (Events, Triggers)")
+            raise self._plugin_error(f"gave ({gave or type(piece).__name__}), expected (Events, Triggers)")
         events, triggers = piece
         if not self._gives_bits and len(events) and events.p.max() > 1:
-            raise self._refused(f"gave polarity {events.p.max()}, expected 0 or 1")
+            raise self._plugin_error(f"gave polarity {events.p.max()}, expected 0 or 1")
         return events, triggers
 
     @contextmanager
-    def _guarded(self) -> Iterator[None]:
-        """A plugin's source that fails is named; a fault of the SDK's own stays what it is."""
+    def _wrap_faults(self) -> Iterator[None]:
+        """Turn a fault of a plugin's source into a `PluginError`; one of the SDK's own passes."""
         try:
             yield
         except EvlcpError:
@@ -209,9 +209,9 @@ class EventSource(ABC):
                 raise
             last = traceback.extract_tb(fault.__traceback__)[-1]
             what = f"{type(fault).__name__}: {fault}".splitlines()[0]
-            raise self._refused(f"{what} ({Path(last.filename).name}, line {last.lineno})") from fault
+            raise self._plugin_error(f"{what} ({Path(last.filename).name}, line {last.lineno})") from fault
 
-    def _refused(self, what: str) -> PluginError:
+    def _plugin_error(self, what: str) -> PluginError:
         return PluginError(f"{self.path}: source {type(self).__name__}: {what}")
 
     def chunks(self, max_events: int = DEFAULT_MAX_EVENTS) -> Iterator[Events]:
@@ -226,7 +226,7 @@ class EventSource(ABC):
                 yield events
 
     def read(self) -> tuple[Events, Triggers]:
-        """Return all that follows at once.
+        """Return all following events and triggers at once.
 
         Raises:
             InputError: The file cannot be read on.
@@ -238,6 +238,6 @@ class EventSource(ABC):
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        # What went wrong before says more than a source that cannot be closed after it.
-        with nullcontext() if error is None else suppress(PluginError), self._guarded():
+        # An earlier error matters more than a failure to close after it.
+        with nullcontext() if error is None else suppress(PluginError), self._wrap_faults():
             self.close()

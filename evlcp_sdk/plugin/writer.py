@@ -1,4 +1,4 @@
-"""What every file that events are written to has in common."""
+"""The base of all writers of recordings."""
 
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -12,20 +12,20 @@ from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.values import Events, Triggers, span_us
 
 LAST_TIME_US = 10**18 - 1
-"""Latest time, and with a minus earliest, that a table holds: 18 digits, us."""
+"""Latest time in a table, us, of 18 digits; its negative is the earliest."""
 
 
 class EventWriter(ABC):
-    """A recording being written, piece by piece; a context manager.
+    """A recording that is written piece by piece; a context manager.
 
-    The file appears under its name only when it is complete: it grows in a hidden place beside it, and an
-    exception in the `with` block removes it. What is not a regular file (a pipe) is written directly.
+    The file appears under its name only when it is complete: until then it is a hidden one beside it, which
+    an exception in the `with` block removes. A pipe or other special file is written directly.
 
     Args:
         path: The file; an existing one is replaced.
         width: Columns of the sensor, or None if unknown; no event may lie outside.
         height: Rows of the sensor, or None.
-        outputs: The files that it comes into place with; None for alone, as soon as it is closed.
+        outputs: The files that are committed together with it; None to commit it alone when it is closed.
 
     Raises:
         OutputError: The file cannot be written.
@@ -55,11 +55,11 @@ class EventWriter(ABC):
             raise
 
     def write(self, events: Events, triggers: Triggers | None = None) -> None:
-        """Append events and triggers, each sorted by time and none before what was written before.
+        """Append events and triggers, each sorted by time and not earlier than those already written.
 
         Raises:
             OutputError: The file cannot be written.
-            StreamError: Times run backward, or a value has no place in the file; nothing is written then.
+            StreamError: Times run backward, or the file cannot hold a value; nothing is written then.
         """
         if triggers is None:
             triggers = Triggers.empty()
@@ -67,28 +67,28 @@ class EventWriter(ABC):
             raise StreamError(f"{self.path}: written to after it was closed")
         self._check_times(events.t_us, "event")
         self._check_times(triggers.t_us, "trigger")
-        self._check("event", "x", events.x, self.width)
-        self._check("event", "y", events.y, self.height)
-        self._check("event", "p", events.p, 2)
-        self._check("trigger", "channel", triggers.channel, self.channels)
-        self._check("trigger", "value", triggers.value, 2)
+        self._check_column("event", "x", events.x, self.width)
+        self._check_column("event", "y", events.y, self.height)
+        self._check_column("event", "p", events.p, 2)
+        self._check_column("trigger", "channel", triggers.channel, self.channels)
+        self._check_column("trigger", "value", triggers.value, 2)
         with writing(self.path):
             self._write(events, triggers)
         if len(events) or len(triggers):
             self._last_us = span_us(events, triggers)[1]
 
     def _begin(self) -> None:  # noqa: B027
-        """Write what belongs at the start to `_file`."""
+        """Write the beginning of the file to `_file`."""
 
     @abstractmethod
     def _write(self, events: Events, triggers: Triggers) -> None:
-        """Append what has been checked to `_file`."""
+        """Append checked events and triggers to `_file`."""
 
     def _finish(self) -> None:  # noqa: B027
-        """Append what belongs at the end."""
+        """Append the end of the file."""
 
     def close(self) -> None:
-        """Complete the file and give it its name; twice does no harm.
+        """Complete the file and give it its name; a second call does nothing.
 
         Raises:
             OutputError: The file cannot be written.
@@ -122,7 +122,7 @@ class EventWriter(ABC):
             if not first <= t <= last:
                 raise StreamError(f"{self.path}: {what} at {t} us, expected {first} to {last} us")
 
-    def _check(self, what: str, name: str, column: NDArray[Any], size: int | None) -> None:
+    def _check_column(self, what: str, name: str, column: NDArray[Any], size: int | None) -> None:
         if size is None or not len(column) or column.max() < size:
             return
         k = int((column >= size).argmax())

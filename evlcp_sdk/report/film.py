@@ -161,7 +161,7 @@ def gather_footage(
     first_us = last_us = start_us = math.nan
     # Of several links, what one has read waits for the others.
     late_us = _LATE_PACKETS * min(len(links), 2) * max(one.packet.packet_us for one in links.values())
-    with registry.joined(probe):
+    with registry.add_temporarily(probe):
         receiver = Receiver([*links.values()], registry.hook)
         for events in source.chunks():
             last_us = float(events.t_us[-1])

@@ -15,8 +15,8 @@ from evlcp_sdk.diagnosis.facts import Facts, other_codewords
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.diagnosis.tallies import PositionTally, RunTally
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.link.several import named_links, placing_links
-from evlcp_sdk.plugin.records import choose_sinks, installed_sinks
+from evlcp_sdk.link.several import name_links, select_positioning_links
+from evlcp_sdk.plugin.records import choose_sinks, find_sinks
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.lines import JsonLines
@@ -70,9 +70,9 @@ class ResultWriter:
     ) -> None:
         self._on_fix = on_fix
         self._registry = Registry.load() if registry is None else registry
-        self._links = named_links(link)
+        self._links = name_links(link)
         first = next(iter(self._links.values()))
-        placing = placing_links(self._links) if plan is not None else {}
+        placing = select_positioning_links(self._links) if plan is not None else {}
         self._navigator: Navigator | None = None
         if plan is not None:
             # Imported here: it takes a tenth of a start.
@@ -98,10 +98,10 @@ class ResultWriter:
         with ExitStack() as stack:
             if folder is not None:
                 classes = load_sinks(choose_sinks(self._registry, sinks, positions=plan is not None))
-                files = [file for s in installed_sinks(self._registry).values() for file in s.record.files]
+                files = [file for s in find_sinks(self._registry).values() for file in s.record.files]
                 self._folder = stack.enter_context(ResultFolder(folder, files))
                 self._sinks.open(classes, self._folder, run)
-                stack.enter_context(self._registry.joined(*self._sinks.all))
+                stack.enter_context(self._registry.add_temporarily(*self._sinks.all))
             self._stack = stack.pop_all()
 
     def events(self, events: Events) -> None:

@@ -82,7 +82,7 @@ class AlignedFrame(NamedTuple):
     Attributes:
         pilot: The pilot that it goes by, its own if it has one.
         sums_and_next: Polarity sums of pilot and info segment, and of the chips after the frame
-            (`Codebook.chips_after`), int16 (chips, height, width).
+            (`Codebook.trailing_chips`), int16 (chips, height, width).
         offset_px: The rest of the motion in pilot and info segment, float64 (2, chips), px.
         corner_px: Column and row on the sensor of the image's pixel (0, 0) in the chip that starts at
             `middle_us`.
@@ -136,9 +136,9 @@ class FrameAligner:
         across_m = np.diff(np.sort(centres_m[:, 0]))
         self._apart = bool((across_m > (1 + _EVEN) * self._layout.spacing_m).any())
         self._edges = codebook.pilot_edges.astype(np.int64)
-        self._every = codebook.edge_every
+        self._every = codebook.edge_spacing_chips
         self._telling = slice(1, packet.pilot_chips, self._every)
-        self._after = codebook.chips_after
+        self._after = codebook.trailing_chips
         self._separate = separate
         self._sensor_px = sensor_px
         self._halves: NDArray[np.float64] = (

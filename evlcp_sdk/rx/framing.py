@@ -175,7 +175,7 @@ class PacketFraming(Framer):
         self._regions, self._follower = regions, follower
         self._name = name
         self._transmitters = Transmitters(
-            link.packet, self._step_us, stream.limits, stream.numbers, link.codebook.chips_after
+            link.packet, self._step_us, stream.limits, stream.numbers, link.codebook.trailing_chips
         )
         self._preamble = 2 * link.codebook.preamble.astype(np.float64) - 1
         self._reflections = queue.reflections

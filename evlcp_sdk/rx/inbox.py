@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message, carried_bytes, joined
+from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message, join_parts, total_bytes
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import BlockCoder
@@ -219,7 +219,7 @@ class MessageAssembler:
 
     def _block(self, llr: NDArray[np.float32]) -> bytes | None:
         try:
-            return self._coder.block(llr)
+            return self._coder.decode_block(llr)
         except (Exception, SystemExit) as fault:
             if self._guard is not None:
                 self._guard.blame(fault)
@@ -237,7 +237,7 @@ class MessageAssembler:
             self.counts["parts_conflicting"] += 1
             inbox.done.pop(key, None)
             self._missing(inbox.open.pop(key, None))
-        carried = carried_bytes(block.length, self._room)
+        carried = total_bytes(block.length, self._room)
         parts = inbox.open.setdefault(key, _Parts(block.length, carried))
         inbox.open.move_to_end(key)
         parts.parts[block.index] = block.part
@@ -246,7 +246,7 @@ class MessageAssembler:
         if sum(map(len, parts.parts.values())) != parts.carried:
             return []
         try:
-            parts.payload = joined([parts.parts[i] for i in sorted(parts.parts)], parts.length)
+            parts.payload = join_parts([parts.parts[i] for i in sorted(parts.parts)], parts.length)
         except BlockError:
             # Two messages under one number, mixed: the newest part is surely of the newest.
             self.counts["messages_mixed"] += 1

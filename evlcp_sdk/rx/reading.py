@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import edges_of_chips
-from evlcp_sdk.air.frames import chips_behind
+from evlcp_sdk.air.frames import chips_after_frame
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Tracker
 from evlcp_sdk.rx import _kernels
@@ -104,7 +104,7 @@ class Steps:
         include the chip after it.
         """
         guard = self._guards["decoding"]
-        more = () if self._codebook.pairs else (before, after)
+        more = () if self._codebook.is_pair_coded else (before, after)
         with guard:
             soft = self._decode(presence, sums, *more)
         if guard.checks:
@@ -247,15 +247,15 @@ class FrameReader:
         self._camera = link.camera
         self._is_column = float(np.ptp(centres_m[:, 0])) < 1e-9
         self._pilot_chips = link.packet.pilot_chips
-        self._least_lit = _MIN_EVENT_SHARE * book.least_activity
-        self._least_half = _DIMMED_SHARE if book.pairs else 0.0
+        self._least_lit = _MIN_EVENT_SHARE * book.least_edge_ratio
+        self._least_half = _DIMMED_SHARE if book.is_pair_coded else 0.0
         self._steps, self._aligner = steps, aligner
         self._layout = layout_of(centres_m)
         self._pairs = neighbours(self._layout)
-        self._pilots, self._every = book.pilots.astype(np.int64), book.edge_every
+        self._pilots, self._every = book.pilots.astype(np.int64), book.edge_spacing_chips
         edges = edges_of_chips(book.pilots).astype(np.int64)
-        self._find_points = points_finder(self._layout, edges, book.edge_every)
-        self._behind = [chips_behind(book, link.packet, n) for n in range(link.packet.frames)]
+        self._find_points = points_finder(self._layout, edges, book.edge_spacing_chips)
+        self._behind = [chips_after_frame(book, link.packet, n) for n in range(link.packet.frames)]
         for chips in self._behind:
             chips.setflags(write=False)
 
@@ -407,7 +407,7 @@ class FrameDecoder:
         It does not matter to pair codes, and is not known there.
         """
         book = self._codebook
-        if book.pairs:
+        if book.is_pair_coded:
             return self._unknown
         if due.has_pilot:
             return book.pilots[:, -1].astype(np.int8)

@@ -10,7 +10,7 @@ import pluggy
 from evlcp_sdk.clock import Timeline, TimeStep
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.link.several import named_links
+from evlcp_sdk.link.several import name_links
 from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx.detected import DetectorTracker
 from evlcp_sdk.rx.framer import Announcer, Framer, StreamContext, to_camera_time
@@ -87,7 +87,7 @@ class Receiver:
         on_frame: Callable[[Frame], None] | None = None,
         workers: int = 1,
     ) -> None:
-        links = named_links(link)
+        links = name_links(link)
         first, camera = next(iter(links.values())), next(iter(links.values())).camera
         self._timeline = Timeline(first.regions.step_us, camera.width, camera.height, limits.step_events)
         self._clock = clock = self._timeline.clock

@@ -68,7 +68,7 @@ class PacketGrid:
 
     Attributes:
         format: Lengths of a packet's parts.
-        chips_after: Chips after a frame that are read with it (`Codebook.chips_after`).
+        chips_after: Chips after a frame that are read with it (`Codebook.trailing_chips`).
         lock: The newest lock; None before the first.
         packet: Number of the lock's packet, counted from the first that may have a frame here.
         frame: Next frame to decode, counted from the first of packet 0.

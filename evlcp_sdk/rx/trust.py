@@ -90,14 +90,14 @@ class BeaconJudge:
         """What a beacon's signature is worth, whatever was known before."""
         if signature is None:
             return Standing("unverified", "no signature yet")
-        good = self._keys.check(message, self._codebook, signature)
+        good = self._keys.verify(message, self._codebook, signature)
         if good is None:
             return Standing("unverified", "signed by a key that is not trusted")
         if not good:
             return Standing("forged", "the signature is not that of this beacon")
-        if self._keys.revoked(signature):
+        if self._keys.is_revoked(signature):
             return Standing("forged", "signed by a key that is revoked")
-        grants = [one for one in self._keys.grants(signature) if one.for_id(message.transmitter_id)]
+        grants = [one for one in self._keys.find_grants(signature) if one.covers_id(message.transmitter_id)]
         if not grants:
             return Standing("forged", f"signed by a key that is not for transmitter {message.transmitter_id}")
         grants = [grant for grant in grants if _for_place(grant, beacon)]
@@ -118,7 +118,7 @@ class BeaconJudge:
         """What a good signature is worth at a time; the reasons do not change as time goes by."""
         signed_s, oldest_s = message.sequence, self._spec.max_age_s
         signed = f"signed {_utc(signed_s)}"
-        grants = [grant for grant in grants if grant.holds_at(signed_s)]
+        grants = [grant for grant in grants if grant.is_valid_at(signed_s)]
         if not grants:
             return Standing("unverified", f"{signed}, when its key was not valid")
         if now_s is None:
@@ -128,7 +128,7 @@ class BeaconJudge:
             return Standing("verified", "")
         if now_s < signed_s - _CLOCKS_APART_S:
             return Standing("unverified", f"{signed}, after it was received")
-        if not any(grant.holds_at(max(now_s, signed_s)) for grant in grants):
+        if not any(grant.is_valid_at(max(now_s, signed_s)) for grant in grants):
             return Standing("unverified", f"{signed}; received when its key was not valid any more")
         if oldest_s and now_s - signed_s > oldest_s:
             return Standing("unverified", f"{signed}, longer ago than messages.max_age_s = {oldest_s:g}")

@@ -339,7 +339,7 @@ def load_kernels(link: Link) -> None:
     chip_us, many = link.packet.chip_us, chips.shape[1]
     lock, end_us = SyncLock(0.0, chip_us, 0.0, 0.0, 1.0), many * chip_us
     middle_us = link.packet.pilot_chips // 2 * chip_us
-    read_us = end_us + book.chips_after * chip_us
+    read_us = end_us + book.trailing_chips * chip_us
     due = DueFrame(0, 0, 0, many, True, 0.0, 0.0, end_us, lock, read_us, middle_us)
     t_us = (chip[:, None] + rng.uniform(0.1, 0.9, shape)) * chip_us
     pixels = places.reshape(book.clusters, -1)[cluster]

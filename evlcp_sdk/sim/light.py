@@ -13,7 +13,7 @@ from evlcp_sdk.air.blocks import HEADER_BYTES, Kind, Message
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import read_npy
-from evlcp_sdk.link.compose import beacon_of_site, packets_of
+from evlcp_sdk.link.compose import beacon_of_site, encode_messages
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite
@@ -269,7 +269,7 @@ class BarLight:
             raise ConfigError(
                 'payload = "messages": expected a text, or a [world] whose place a beacon can send'
             )
-        return packets_of(found, self._coder)
+        return encode_messages(found, self._coder)
 
     def symbols(self, packet: int) -> NDArray[np.int64]:
         """Symbols of a packet, counted from the one that `start_chip` is in: int64 (frames, clusters)."""
@@ -282,10 +282,10 @@ class BarLight:
         if self.bar.payload == "data":
             part = rng.bytes(self._coder.block_bytes - HEADER_BYTES)
             message = Message(Kind.DATA, self._transmitter_id, packet, part)
-            one: NDArray[np.int64] = packets_of([message], self._coder)[0]
+            one: NDArray[np.int64] = encode_messages([message], self._coder)[0]
             return one
         book = self.link.codebook
-        return rng.integers(0, book.carrying, (self.link.packet.frames, book.clusters))
+        return rng.integers(0, book.data_symbols, (self.link.packet.frames, book.clusters))
 
     def sent_symbols(self, duration_s: float) -> list[list[list[int]]]:
         """Symbols [packet][frame][cluster] of every packet that at least starts in the scene."""

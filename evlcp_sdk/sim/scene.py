@@ -19,7 +19,7 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import path_exists
-from evlcp_sdk.link.resolve import Link, resolve, with_leds
+from evlcp_sdk.link.resolve import Link, load_led_file, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.camera import CameraModel
@@ -605,7 +605,7 @@ class _Whole(dict[str, Any]):
 
     @classmethod
     def read(cls, path: Path | str) -> "_Whole":
-        whole = cls(with_leds(read_toml(path), Path(path).parent, f"{path}: "))
+        whole = cls(load_led_file(read_toml(path), Path(path).parent, f"{path}: "))
         whole.file = str(path)
         return whole
 
@@ -621,7 +621,7 @@ def _read_links(table: dict[str, Any], folder: Path | None, before: str) -> None
             except ConfigError as fault:
                 raise ConfigError(f"{before}{where}: {fault}") from fault
         elif isinstance(link, Mapping):
-            whole = with_leds(link, folder or Path(), f"{before}{where}: ")
+            whole = load_led_file(link, folder or Path(), f"{before}{where}: ")
             if isinstance(link, _Whole):
                 link.update(whole)
             else:

@@ -17,7 +17,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io import EventSource, open_source
 from evlcp_sdk.io.describe import check_sensor
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.link.several import load_links, named_links
+from evlcp_sdk.link.several import load_links, name_links
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
@@ -91,7 +91,7 @@ def load_variants(
             continue
         try:
             links = load_links(path, [*overrides, *settings], registry)
-            found.append(Variant(name, settings, named_links(links)))
+            found.append(Variant(name, settings, name_links(links)))
         except ConfigError as fault:
             lines = str(fault).splitlines()
             faults += [f"--variant {name}: {line.removeprefix('--set: ')}" for line in lines]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.link.shared import differences
+from evlcp_sdk.link.shared import find_differences
 from evlcp_sdk.rx.reflections import TRAILING_CHIPS
 from evlcp_sdk.sim.truth import SentBar, Truth
 from evlcp_sdk.study.frames import FrameRow
@@ -160,7 +160,7 @@ def match(
     found: tuple[set[int], ...] = tuple(set() for _ in bars)
     unmatched = echoes = 0
     senders = {
-        name: [i for i, one in enumerate(bars) if not differences(one.bar.link, link)]
+        name: [i for i, one in enumerate(bars) if not find_differences(one.bar.link, link)]
         for name, link in (links or {}).items()
     }
     for frame in frames:
@@ -225,7 +225,7 @@ def check_link(truth: Truth, link: Link | Mapping[str, Link], name: str, *, mess
     for i, bar in enumerate(truth.bars):
         if bar.lit and bar.sends_frames:
             found = [
-                differences(bar.link, one, messages=messages and bar.payload != "symbols")
+                find_differences(bar.link, one, messages=messages and bar.payload != "symbols")
                 for one in ([link] if isinstance(link, Link) else link.values())
             ]
             if all(found):

@@ -117,7 +117,7 @@ def message_tallies(packets: Iterable[Packet], truth: Truth, coder: BlockCoder) 
             tallies.append((0, Tally(messages_wrong=1)))
             continue
         _, whole, distance_m = sent[bar]
-        read = coder.symbols(packet.block.pack(coder.block_bytes))
+        read = coder.encode_symbols(packet.block.pack(coder.block_bytes))
         if not np.array_equal(read, bars[bar].symbols[number]):
             tallies.append((segment_of(float(distance_m[number])), Tally(messages_wrong=1)))
         elif whole[number]:

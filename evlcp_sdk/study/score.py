@@ -12,7 +12,7 @@ from typing import Any
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.formatting import round_or_none
 from evlcp_sdk.link.resolve import Link, resolve
-from evlcp_sdk.link.shared import differences
+from evlcp_sdk.link.shared import find_differences
 from evlcp_sdk.plugin.records import SUMMARY
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.folder import read_summary
@@ -47,7 +47,7 @@ def _score(
         row = _figures(Statistics.of(bar_tallies(sent, pairs)), road=road)
         if links:
             link = sent.bar.link
-            row["link"] = next((name for name, one in links.items() if not differences(link, one)), None)
+            row["link"] = next((name for name, one in links.items() if not find_differences(link, one)), None)
         bars.append(row)
     echoes = {"echoes": found.echoes} if road else {}
     return {"rows": len(frames), "unmatched": found.unmatched} | echoes | {"bars": bars}

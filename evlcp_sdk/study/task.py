@@ -73,7 +73,7 @@ def environment_of(registry: Registry) -> dict[str, Any]:
     root = Path(evlcp_sdk.__file__).parent
     files = {root / "values.py", root / "specs.py"} | {root / "study" / name for name in _STUDY}
     files |= {path for name in _PACKAGES for path in (root / name).rglob("*.py")}
-    for installed in registry.installed():
+    for installed in registry.list_algorithms():
         if installed.distribution == "evlcp-sdk":
             spec = find_spec(installed.algorithm.target.partition(":")[0].partition(".")[0])
             if spec is not None and spec.origin is not None:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import are_pairs, edges_of_chips
+from evlcp_sdk.air.codebook import edges_of_chips, is_pair_code
 from evlcp_sdk.air.frames import bits_of_symbols, symbols_of_bits
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.testing.exercises import link_of
@@ -42,7 +42,7 @@ def _chips(code: NDArray[np.uint8], dimensions: int, name: str) -> None:
 
 def _edges(code: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Those that tell codes apart: in the middle of pairs, else all."""
-    return edges_of_chips(code)[..., :: 2 if are_pairs(code) else 1].astype(np.int64)
+    return edges_of_chips(code)[..., :: 2 if is_pair_code(code) else 1].astype(np.int64)
 
 
 @law("shapes", "uint8 chips, one code per cluster")
@@ -60,7 +60,7 @@ def _pilots_apart(subject: Subject) -> None:
         alike = edges @ edges.T / np.outer(many, many)
         np.fill_diagonal(alike, -1)
         i, j = np.unravel_index(alike.argmax(), alike.shape)
-        most = _MOST_ALIKE if are_pairs(codes) else _MOST_EDGES_ALIKE
+        most = _MOST_ALIKE if is_pair_code(codes) else _MOST_EDGES_ALIKE
         expect(
             alike.max() <= most,
             f"two of {len(codes)} pilots to correlate by {most} at most,"
@@ -72,7 +72,7 @@ def _pilots_apart(subject: Subject) -> None:
 def _sharp_preamble(subject: Subject) -> None:
     preamble = subject.algorithm.preamble()
     code = _edges(preamble)
-    most, near = (_MOST_SIDELOBE, 1) if are_pairs(preamble) else (_MOST_EDGES_ALIKE, _NEAR_CHIPS)
+    most, near = (_MOST_SIDELOBE, 1) if is_pair_code(preamble) else (_MOST_EDGES_ALIKE, _NEAR_CHIPS)
     side = np.abs(np.correlate(code, code, "full")[len(code) - 1 + near :]).max(initial=0) / (code**2).sum()
     expect(side <= most, f"sidelobes of the preamble of {most} at most, got {side:.2f}")
 

@@ -30,7 +30,7 @@ def subject_of(role: str, algorithm: Any, link: Link | None = None) -> Subject:
     if link is not None and link.algorithms[role] == algorithm:
         return Subject(role, algorithm, link, link.table[role]["id"])
     target = f"{type(algorithm).__module__}:{type(algorithm).__qualname__}"
-    ids = (e.algorithm.id for e in Registry.load().installed(role) if e.algorithm.target == target)
+    ids = (e.algorithm.id for e in Registry.load().list_algorithms(role) if e.algorithm.target == target)
     return Subject(role, algorithm, link, next(ids, None))
 
 
@@ -59,7 +59,7 @@ def link_of(subject: Subject, **air: Any) -> Link:
     if subject.role == "pilots":
         compile_or_skip(lambda: subject.algorithm.codes(link.bar.clusters))
     link = link.with_algorithm(subject.role, subject.algorithm, id=subject.id)
-    if not link.codebook.pairs:
+    if not link.codebook.is_pair_coded:
         link = _of_chips(link, subject.role)
     return link.with_air(**air) if air else link
 
@@ -68,7 +68,7 @@ def _of_chips(link: Link, kept: str) -> Link:
     """The link with the defaults for codes of any chips where it has those for pair codes."""
     registry = Registry.load()
     for name, role in ROLES.items():
-        usual, other = role.default_for(link.bar), role.default_for(link.bar, link.codebook.of_chips)
+        usual, other = role.default_for(link.bar), role.default_for(link.bar, link.codebook.unpaired_codes)
         if usual != other and name != kept and link.table.get(name, {}).get("id") == usual:
             link = link.with_algorithm(name, registry.load_class(name, other)(), id=other)
     return link

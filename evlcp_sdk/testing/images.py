@@ -100,7 +100,7 @@ def _decoders(subject: Subject) -> Iterator[tuple[Codebook, Decode]]:
     """The subject compiled for the SDK's modulations and the link's that it takes, with the link's pilots."""
     registry, link = Registry.load(), link_of(subject)
     books = []
-    for entry in registry.installed("modulation"):
+    for entry in registry.list_algorithms("modulation"):
         if entry.distribution == "evlcp-sdk":
             modulation = registry.load_class("modulation", entry.algorithm.id)()
             books.append(link.with_algorithm("modulation", modulation, id=entry.algorithm.id).codebook)
@@ -136,10 +136,10 @@ def _decoding_shapes(subject: Subject) -> None:
 @law("inverts", "every symbol of every profile comes back from an ideal image")
 def _decoding_inverts(subject: Subject) -> None:
     for book, decode in _decoders(subject):
-        n, k = book.carrying, book.clusters
+        n, k = book.data_symbols, book.clusters
         for first in range(0, n, k):
             symbols = (first + np.arange(k)) % n
-            for after, what in _FOLLOWED[:1] if book.pairs else _FOLLOWED:
+            for after, what in _FOLLOWED[:1] if book.is_pair_coded else _FOLLOWED:
                 got = decode(*ideal_frame(book, symbols, after=after)).symbols
                 for wrong in np.flatnonzero(got != symbols)[:1]:
                     first_wrong = f"symbol {symbols[wrong]}{what}, got {got[wrong]}"

@@ -45,7 +45,7 @@ class IdealBar:
 def random_symbols(link: Link, packets: int, seed: int = 0) -> NDArray[np.int64]:
     """Random symbols of a link, of those that carry bits, int64 (packets, frames, clusters)."""
     shape = (packets, link.packet.frames, link.codebook.clusters)
-    return np.random.default_rng(seed).integers(0, link.codebook.carrying, shape)
+    return np.random.default_rng(seed).integers(0, link.codebook.data_symbols, shape)
 
 
 def ideal_events(

@@ -99,7 +99,7 @@ def ideal_frame(
         segment and after it, int8 (K,) each.
     """
     presence = ideal_presence(codebook.clusters)
-    if codebook.pairs:
+    if codebook.is_pair_coded:
         return presence, ideal_sums(codebook, symbols, missing=missing, seed=seed)
     before = codebook.pilots[:, -1].astype(np.int8)
     behind = np.broadcast_to(np.asarray(after, np.int8), codebook.clusters).copy()

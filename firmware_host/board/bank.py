@@ -247,7 +247,7 @@ def queue_of(link: Link) -> Bank:
 def random_symbols(packets: int, frames: int, codebook: Codebook, generator: np.random.Generator) -> Symbols:
     """Uniform symbols, of those that carry bits, int64 (packets, frames, clusters)."""
     shape = (packets, frames, codebook.clusters)
-    return generator.integers(0, codebook.carrying, shape, dtype=np.int64)
+    return generator.integers(0, codebook.data_symbols, shape, dtype=np.int64)
 
 
 def random_packets(packets: int, link: Link, seed: int) -> Symbols:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
-from evlcp_sdk.link.compose import messages_of, packets_of, utf8
+from evlcp_sdk.link.compose import encode_messages, encode_utf8, make_messages
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.specs import SpecError, build_spec, format_value, read_toml
@@ -192,16 +192,16 @@ def _message(folder: Path, entry: Entry, link: Link) -> Bank:
     site = None
     if entry.beacon is not None:
         site = site_that_sends(folder / entry.beacon, entry.transmitter_id, "transmitter_id")
-    messages = messages_of(
+    messages = make_messages(
         link,
         text=entry.text,
         beacon=site,
-        user=utf8(entry.user, "user"),
+        user=encode_utf8(entry.user, "user"),
         key=None if entry.key is None else folder / entry.key,
         transmitter_id=entry.transmitter_id,
         sequence=entry.sequence,
     )
-    return bank_of(packets_of(messages, link.block_coder(), entry.repeat), link)
+    return bank_of(encode_messages(messages, link.block_coder(), entry.repeat), link)
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.air.kinds import Countdown
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.compose import each_packet, messages_of, packets_of
+from evlcp_sdk.link.compose import encode_messages, iterate_packets, make_messages
 from evlcp_sdk.scene.sites import BarSite, load_sites
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class Content:
     """What is to be sent, some of which changes with the time.
 
     Attributes:
-        fixed: What does not: arguments of `messages_of`.
+        fixed: What does not: arguments of `make_messages`.
         text: A text; where it is sent anew, `{time}`, `{left}` and `{n}` in it are filled in.
         time: The time is sent.
         ends_s: When what a signal shows ends, seconds since 1970.
@@ -58,7 +58,7 @@ class Content:
             text = text.replace("{time}", strftime("%H:%M:%S", gmtime(at_s))).replace("{n}", str(number))
             text = text.replace("{left}", f"{left_s:.0f}")
         sequence = self.sequence + (number or 0)
-        return messages_of(link, **self.fixed, text=text, other=other, sequence=sequence)
+        return make_messages(link, **self.fixed, text=text, other=other, sequence=sequence)
 
 
 def site_that_sends(path: Path, transmitter_id: int | None, by: str) -> BarSite:
@@ -88,7 +88,7 @@ def check_interval(content: Content, link: Link, repeat: int, every_s: float) ->
     Raises:
         ConfigError: It does.
     """
-    many = len(packets_of(content.at(link, clock_s(), 0), link.block_coder(), repeat))
+    many = len(encode_messages(content.at(link, clock_s(), 0), link.block_coder(), repeat))
     takes_s = many * packet_s(link)
     if takes_s > every_s:
         raise ConfigError(
@@ -118,6 +118,6 @@ def send_anew(
         over = content.ends_s is not None and number and at_s > content.ends_s + every_s
         if over or (count is not None and number >= count):
             return None
-        return each_packet(content.at(link, at_s, number), coder, repeat)
+        return iterate_packets(content.at(link, at_s, number), coder, repeat)
 
     stream.play(next_one, every_s, stopped)

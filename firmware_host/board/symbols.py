@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_json
 from evlcp_sdk.link.resolve import Link, resolve
-from evlcp_sdk.link.shared import differences
+from evlcp_sdk.link.shared import find_differences
 from evlcp_sdk.plugin.registry import Registry
 from firmware_host.errors import IncompatibleError
 
@@ -82,7 +82,7 @@ def _own_link(path: Path, table: dict[str, Any], given: Link | None, registry: R
             f" ({own.codebook.profile}): made with other codes than those of its link; make the file again"
         )
     if given is not None:
-        differ = differences(own, given, messages=_CORRECTION in tables)
+        differ = find_differences(own, given, messages=_CORRECTION in tables)
         if differ:
             raise IncompatibleError(
                 f"{path}: made with another link: {'; '.join(differ)}; leave out -c and --set to use its own"

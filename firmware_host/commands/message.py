@@ -75,7 +75,7 @@ class ContentOptions:
 
         from evlcp_sdk.errors import ConfigError
         from evlcp_sdk.files import read_bytes
-        from evlcp_sdk.link.compose import utf8
+        from evlcp_sdk.link.compose import encode_utf8
         from firmware_host.board.messages import Content, site_that_sends
 
         if not self.time and (self.text, self.file, self.beacon, self.countdown) == (None,) * 4:
@@ -86,7 +86,7 @@ class ContentOptions:
         if self.beacon is None and (self.key is not None or self.user):
             raise ConfigError("--key and --user belong to a beacon: give --beacon site.toml, too")
         for option, given in (("--text", self.text), ("--user", self.user)):
-            utf8(given or "", option)
+            encode_utf8(given or "", option)
         site = None if self.beacon is None else site_that_sends(self.beacon, self.transmitter_id, "--id")
         fixed = {
             "data": None if self.file is None else read_bytes(self.file),
@@ -271,11 +271,11 @@ def _compose(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int6
     """Symbols of the packets that say it now, and what they are."""
     from time import time as clock_s
 
-    from evlcp_sdk.link.compose import packets_of
+    from evlcp_sdk.link.compose import encode_messages
     from firmware_host.board.messages import packet_s
 
     messages = content.at(link, clock_s())
-    symbols = packets_of(messages, link.block_coder(), repeat)
+    symbols = encode_messages(messages, link.block_coder(), repeat)
     return symbols, {
         "messages": [
             {

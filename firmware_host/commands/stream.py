@@ -65,7 +65,7 @@ def stream(
     # before the board waits for packets
     coder = link.block_coder() if lines == "text" else None
     if coder is not None:
-        coder.symbols(bytes(coder.block_bytes))
+        coder.encode_symbols(bytes(coder.block_bytes))
     packets = _packets(file, link, coder, transmitter_id, repeat)
     with open_board(context) as board:
         started = board.stream(link, ahead)
@@ -103,7 +103,7 @@ def _packets(
     import numpy as np
 
     from evlcp_sdk.errors import ConfigError, InputError
-    from evlcp_sdk.link.compose import each_packet, messages_of
+    from evlcp_sdk.link.compose import iterate_packets, make_messages
     from firmware_host.board.symbols import symbols_of
 
     sequence = 0
@@ -125,8 +125,8 @@ def _packets(
             else:
                 # a later message has a higher number, also within a second
                 sequence = max(sequence + 1, int(time.time()))
-                said = messages_of(link, text=line, transmitter_id=transmitter_id, sequence=sequence)
-                yield each_packet(said, coder, repeat)
+                said = make_messages(link, text=line, transmitter_id=transmitter_id, sequence=sequence)
+                yield iterate_packets(said, coder, repeat)
         except (ValueError, RecursionError) as fault:
             raise InputError(f"{file}: line {number}: not JSON: {fault}") from fault
         except ConfigError as fault:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_barker import _kernels
-from evlcp_sdk.air.codebook import Codebook, are_pairs, edges_of_chips
+from evlcp_sdk.air.codebook import Codebook, edges_of_chips, is_pair_code
 from evlcp_sdk.air.frames import packet_chips
 
 _HALF = 0.5
@@ -34,7 +34,7 @@ def due_chips(preamble: NDArray[np.uint8]) -> NDArray[np.bool_]:
     The first may have one before it, whatever was sent there.
     """
     due = np.ones(len(preamble), np.bool_)
-    if not are_pairs(preamble):
+    if not is_pair_code(preamble):
         due[1:] = edges_of_chips(preamble) != 0
     return due
 
@@ -92,7 +92,7 @@ def guard_chips(preamble: NDArray[np.uint8], least: float) -> int:
     >>> guard_chips(chips_of_values(BARKER13), 0.5), guard_chips(pulses, 0.35)
     (3, 30)
     """
-    if are_pairs(preamble):
+    if is_pair_code(preamble):
         return _APART_CHIPS
     length = len(preamble)
     dark = np.zeros(length, np.uint8)
@@ -108,7 +108,7 @@ def _reach(codebook: Codebook, frames: int, pilot_every: int) -> float:
     """What pilots and random symbols correlate to with the preamble, but for one chip in `_RARELY`."""
     rng = np.random.default_rng(0)
     packets = max(_PACKETS // codebook.clusters, 8)
-    symbols = rng.integers(0, codebook.carrying, (packets, frames, codebook.clusters))
+    symbols = rng.integers(0, codebook.data_symbols, (packets, frames, codebook.clusters))
     chips = np.concatenate([packet_chips(one, codebook, pilot_every) for one in symbols])
     packet, length = len(chips) // packets, len(codebook.preamble)
     counts = _counts(chips)

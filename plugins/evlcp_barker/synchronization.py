@@ -10,7 +10,7 @@ from pydantic import Field
 
 from evlcp_barker import _kernels
 from evlcp_barker.bound import due_chips, guard_chips, least_correlation
-from evlcp_sdk.air.codebook import Codebook, are_pairs
+from evlcp_sdk.air.codebook import Codebook, is_pair_code
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Synchronization
@@ -171,7 +171,7 @@ class BarkerSynchronizer:
         self._packet = packet
         # Events come behind edges, and late ones agree with the chip that they come in.
         self._chips = 2 * codebook.preamble.astype(np.float64) - 1
-        self._pair = 2 if are_pairs(codebook.preamble) else 1
+        self._pair = 2 if is_pair_code(codebook.preamble) else 1
         self._due = due_chips(codebook.preamble)
         self._bin_us = packet.chip_us / _STEPS
         rising = np.flatnonzero(np.diff(self._chips) > 0) + 1

@@ -225,4 +225,4 @@ def _instead(bar: BarLayout, codebook: Codebook) -> str:
     """The ranging for a layout that this one refuses, if any is."""
     if bar.clusters < 2:
         return "no ranging measures the distance of one cluster: use 'none' for this layout"
-    return f"use '{ROLES['ranging'].default_for(bar, codebook.of_chips)}' for this layout"
+    return f"use '{ROLES['ranging'].default_for(bar, codebook.unpaired_codes)}' for this layout"

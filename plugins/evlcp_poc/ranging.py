@@ -108,7 +108,7 @@ class PocRanging(Ranging):
             a, b = a[same], b[same]
         a, b = used[a], used[b]
         apart = np.hypot(*(centres[:, None] - centres).T)
-        instead = f"use '{ROLES['ranging'].default_for(bar, codebook.of_chips)}' for this layout"
+        instead = f"use '{ROLES['ranging'].default_for(bar, codebook.unpaired_codes)}' for this layout"
         if not (bar.has_equal_clusters and bar.has_distinct_centres):
             raise ConfigError(
                 f"ranging 'poc' compares images of clusters, which have to be alike and apart: {instead}"

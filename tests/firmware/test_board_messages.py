@@ -11,7 +11,7 @@ from board_lines import LINK, SITE, check_fault, packets_shown, well
 from test_board_cli import EVLCP
 
 from evlcp_sdk.air.beacons import Beacon
-from evlcp_sdk.air.blocks import Block, Kind, Message, joined
+from evlcp_sdk.air.blocks import Block, Kind, Message, join_parts
 from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.air.kinds import CountdownKind, TimeKind
 from firmware_host.emulators.led_record import RECORD, LedRecord
@@ -42,14 +42,14 @@ def messages_of(symbols, link=LINK):
     parts = {}
     for packet in symbols:
         bits = bits_of_symbols(packet, link.codebook.bits_per_symbol)
-        content = coder.block((4 - 8.0 * bits).astype(np.float32))
+        content = coder.decode_block((4 - 8.0 * bits).astype(np.float32))
         assert content is not None
         block = Block.unpack(content)
         assert block.codebook == coder.digest
         parts.setdefault(block.kind, {})[block.index] = block
     found = {}
     for kind, blocks in parts.items():
-        payload = joined([blocks[i].part for i in range(len(blocks))], blocks[0].length)
+        payload = join_parts([blocks[i].part for i in range(len(blocks))], blocks[0].length)
         found[kind] = Message(kind, blocks[0].transmitter_id, blocks[0].sequence, payload)
     return found
 

@@ -230,7 +230,7 @@ def test_what_changes_is_right_at_its_first_chip(device, latency_s):
     from benchmarks.board import starts_of
     from evlcp_sdk.air.blocks import Kind, Message
     from evlcp_sdk.air.kinds import Countdown, CountdownKind
-    from evlcp_sdk.link.compose import packets_of
+    from evlcp_sdk.link.compose import encode_messages
 
     board, coder = board_on(UsbLine(device, latency_s)), LINK.block_coder()
     made = []
@@ -243,7 +243,7 @@ def test_what_changes_is_right_at_its_first_chip(device, latency_s):
             at_s = device.now_us * 1e-6 + stream.delay_s
             due_us.append(at_s * 1e6)
             result = CountdownKind().pack(Countdown("red", "green", 100.0 - at_s))
-            made.append(packets_of([Message(Kind.COUNTDOWN, 7, number, result)], coder))
+            made.append(encode_messages([Message(Kind.COUNTDOWN, 7, number, result)], coder))
             return made[-1]
 
         assert stream.play(next_one, 0.25) == 8

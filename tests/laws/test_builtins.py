@@ -15,7 +15,7 @@ DO_NOTHING = {
 
 CASES = [
     pytest.param(entry.algorithm.role, entry.algorithm.id, law, id=f"{entry.algorithm.id}-{law.name}")
-    for entry in REGISTRY.installed()
+    for entry in REGISTRY.list_algorithms()
     if entry.distribution == "evlcp-sdk"
     for law in laws_of(entry.algorithm.role)
 ]

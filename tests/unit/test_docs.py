@@ -170,7 +170,7 @@ def test_every_role_has_a_section_with_its_verbs_and_algorithms(role: str) -> No
     abstract = ROLES[role].abstract
     for verb in abstract.__abstractmethods__:
         assert f"{abstract.__name__}.{verb}(" in section
-    for entry in Registry.load().installed(role):
+    for entry in Registry.load().list_algorithms(role):
         if entry.distribution == "evlcp-sdk":
             assert f"`{entry.algorithm.id}`" in section
             if fields(Registry.load().load_class(role, entry.algorithm.id)):

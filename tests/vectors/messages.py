@@ -5,9 +5,9 @@ import json
 from itertools import product
 
 from evlcp_sdk.air.beacons import Beacon
-from evlcp_sdk.air.blocks import Kind, Message, split
-from evlcp_sdk.air.signing import signed_bytes
-from evlcp_sdk.link.blocks import interleaver
+from evlcp_sdk.air.blocks import Kind, Message, split_message
+from evlcp_sdk.air.signing import signature_input
+from evlcp_sdk.link.blocks import interleaver_order
 from evlcp_sdk.link.resolve import load_link
 
 PROFILES = ("wh4x2", "wh8", "raw8")
@@ -29,9 +29,9 @@ def vectors():
         overrides = [f"modulation.id={profile}", f"error-correction.id={code}"]
         coder = load_link(overrides=overrides).block_coder()
         for message in messages():
-            for block in split(message, coder.digest, coder.block_bytes):
+            for block in split_message(message, coder.digest, coder.block_bytes):
                 packed = block.pack(coder.block_bytes)
-                symbols = coder.symbols(packed).astype("uint8").tobytes()
+                symbols = coder.encode_symbols(packed).astype("uint8").tobytes()
                 packet = {
                     "profile": profile,
                     "error_correction": code,
@@ -50,8 +50,8 @@ def vectors():
                 packets.append(packet)
     digest = load_link().block_coder().digest
     return {
-        "interleaver_960": interleaver(960).tolist(),
-        "signed_bytes": signed_bytes(messages()[0], digest).hex(),
+        "interleaver_960": interleaver_order(960).tolist(),
+        "signed_bytes": signature_input(messages()[0], digest).hex(),
         "packets": packets,
     }
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from evlcp_sdk.air.beacons import BEACON_BYTES, Beacon
-from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message, joined, split
+from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message, join_parts, split_message
 from evlcp_sdk.air.crc import crc24
 from evlcp_sdk.errors import ConfigError
 
@@ -28,7 +28,7 @@ U32 = st.integers(0, 2**32 - 1)
 )
 def test_a_message_is_the_sum_of_its_blocks(transmitter_id, sequence, payload, size, kind) -> None:
     message = Message(kind, transmitter_id, sequence, payload)
-    blocks = list(split(message, DIGEST, size))
+    blocks = list(split_message(message, DIGEST, size))
     # Independent of the module: a message of several blocks is followed by its CRC-32.
     carried = payload
     if len(payload) > size - 17:
@@ -38,7 +38,7 @@ def test_a_message_is_the_sum_of_its_blocks(transmitter_id, sequence, payload, s
     assert {len(p) for p in packed} == {size}
     assert [Block.unpack(p) for p in packed] == blocks
     assert b"".join(b.part for b in blocks) == carried
-    assert joined([b.part for b in blocks], len(payload)) == payload
+    assert join_parts([b.part for b in blocks], len(payload)) == payload
     for i, p in enumerate(packed):
         # Independent of the module: the table of docs/messages.md. What follows is whitened: test_vectors.
         head = struct.pack("<BIIHH", 0x10 + kind, transmitter_id, sequence, i, len(payload)) + DIGEST
@@ -77,7 +77,7 @@ BEYOND = (90.1, -181.0, math.nan, -1.0, 181.0, 0.0), (-90.1, 181.0, -13e3, 361.0
         (lambda: Message(Kind.TEXT, 0, 2**32, b"a"), "sequence = 4294967296, expected"),
         (lambda: Message(Kind.DATA, 0, 0, b""), "0 bytes of data, expected 1 to 65535"),
         (lambda: Message(Kind.DATA, 0, 0, bytes(65536)), "65536 bytes of data"),
-        (lambda: next(split(Message(Kind.DATA, 1, 2, bytes(65535)), DIGEST, HEADER_BYTES + 1)),
+        (lambda: next(split_message(Message(Kind.DATA, 1, 2, bytes(65535)), DIGEST, HEADER_BYTES + 1)),
          "65535 bytes in parts of 1, expected at most 65536 parts"),
         *((partial(Beacon, **(BEACON | {name: value})), f"beacon: {name} = {value}, expected")
           for values in BEYOND for name, value in zip(BEACON_NAMES, values, strict=True)),

@@ -13,7 +13,13 @@ from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
 from evlcp_wh.pilots import WhPilots
 
 from evlcp_sdk.air.codebook import Codebook, chips_of_values, hadamard, word_of_chips
-from evlcp_sdk.air.frames import PacketFormat, bits_of_symbols, chips_behind, packet_chips, symbols_of_bits
+from evlcp_sdk.air.frames import (
+    PacketFormat,
+    bits_of_symbols,
+    chips_after_frame,
+    packet_chips,
+    symbols_of_bits,
+)
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Modulation
 
@@ -83,7 +89,7 @@ def test_what_follows_a_frame_is_what_is_on_air(frames, every, preamble, first) 
     for frame in range(frames):
         behind = chips[starts + form.frame_start_chip(frame + 1)].reshape(20, 2).astype(np.int8)
         alike = (behind == behind[0]).all(0)
-        assert chips_behind(book, form, frame).tolist() == np.where(alike, behind[0], -1).tolist()
+        assert chips_after_frame(book, form, frame).tolist() == np.where(alike, behind[0], -1).tolist()
 
 
 CHIPS = Codebook("ppm", np.array([0, 1, 1]), np.array([[0, 1, 0], [1, 0, 0]]), np.eye(3, 4, dtype=int))
@@ -114,8 +120,8 @@ def test_what_is_no_code_or_symbol_is_named(make: Callable[[], object], message:
 
 
 def test_codes_of_any_chips() -> None:
-    assert not CHIPS.pairs
-    assert (CHIPS.bits_per_symbol, CHIPS.carrying, CHIPS.edge_every) == (1, 2, 1)
+    assert not CHIPS.is_pair_coded
+    assert (CHIPS.bits_per_symbol, CHIPS.data_symbols, CHIPS.edge_spacing_chips) == (1, 2, 1)
     assert CHIPS.pilot_edges.tolist() == [[1, -1], [-1, 0]]
     assert CHIPS.to_dict()["codewords"] == ["1000", "0100", "0010"]
     form = PacketFormat.of(CHIPS, 3)
@@ -138,7 +144,7 @@ def test_the_longest_time_between_rises(pilots: WhPilots | DimmedPilots, words: 
     chips = packet_chips(np.tile(pairs[:, None], 16), book, pilot_every=64).astype(np.int8)
     gaps = [np.diff(np.flatnonzero(np.diff(chips[:, k]) > 0)).max() for k in range(16)]
     assert book.longest_gap_chips == max(gaps)
-    assert book.pairs == isinstance(words, Wh4x2)
+    assert book.is_pair_coded == isinstance(words, Wh4x2)
 
 
 def test_c_table_holds_the_words() -> None:

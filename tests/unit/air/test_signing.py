@@ -32,15 +32,15 @@ def test_a_signature_is_that_of_the_documented_bytes(tmp_path: Path) -> None:
     signed = b"EVLCP beacon 1\0" + struct.pack("<II", 7, 42) + DIGEST + bytes(range(30))
     ed25519.Ed25519PublicKey.from_public_bytes(bytes.fromhex(public)).verify(signature.payload[8:], signed)
     trusted = signing.TrustedKeys([signing.TrustedKey(public)])
-    assert trusted.check(BEACON, DIGEST, signature) is True
-    assert trusted.check(BEACON, b"xxxx", signature) is False
-    assert trusted.check(Message(Kind.BEACON, 8, 42, BEACON.payload), DIGEST, signature) is False
-    assert trusted.check(Message(Kind.BEACON, 7, 43, BEACON.payload), DIGEST, signature) is False
+    assert trusted.verify(BEACON, DIGEST, signature) is True
+    assert trusted.verify(BEACON, b"xxxx", signature) is False
+    assert trusted.verify(Message(Kind.BEACON, 8, 42, BEACON.payload), DIGEST, signature) is False
+    assert trusted.verify(Message(Kind.BEACON, 7, 43, BEACON.payload), DIGEST, signature) is False
     short = Message(Kind.SIGNATURE, 7, 42, signature.payload[:-1])
-    assert trusted.check(BEACON, DIGEST, short) is False
-    assert signing.TrustedKeys(()).check(BEACON, DIGEST, signature) is None
+    assert trusted.verify(BEACON, DIGEST, short) is False
+    assert signing.TrustedKeys(()).verify(BEACON, DIGEST, signature) is None
     other = signing.make_key(tmp_path / "other.pem")
-    assert signing.TrustedKeys([signing.TrustedKey(other)]).check(BEACON, DIGEST, signature) is None
+    assert signing.TrustedKeys([signing.TrustedKey(other)]).verify(BEACON, DIGEST, signature) is None
 
 
 @pytest.mark.parametrize("mode", [0o644, 0o640, 0o604, 0o620, 0o601])
@@ -101,9 +101,9 @@ def test_a_link_with_trusted_keys_is_written_and_read_back(tmp_path: Path) -> No
     link = load_link(path)
     first, second = link.messages.trusted_keys
     end_s = datetime(2026, 12, 31, 15, tzinfo=UTC).timestamp()
-    assert [first.holds_at(end_s + s) for s in (-1e9, 0, 1)] == [True, True, False]
-    assert [first.for_id(i) for i in (0, 2**32 - 1)] == [True, True]
-    assert [second.for_id(i) for i in (6, 7, 9, 10)] == [False, True, True, False]
+    assert [first.is_valid_at(end_s + s) for s in (-1e9, 0, 1)] == [True, True, False]
+    assert [first.covers_id(i) for i in (0, 2**32 - 1)] == [True, True]
+    assert [second.covers_id(i) for i in (6, 7, 9, 10)] == [False, True, True, False]
     assert (first.area, second.area) == (None, (35.0, 137.0, 500.0))
     again = tmp_path / "again.toml"
     again.write_text(to_toml(link, Registry.load()))
@@ -121,4 +121,4 @@ def test_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         with pytest.raises(ConfigError, match=r"pip install 'evlcp-sdk\[sign\]'"):
             call()
     # Who trusts no key needs no extra.
-    assert signing.TrustedKeys(()).check(BEACON, DIGEST, Message(Kind.SIGNATURE, 7, 42, bytes(72))) is None
+    assert signing.TrustedKeys(()).verify(BEACON, DIGEST, Message(Kind.SIGNATURE, 7, 42, bytes(72))) is None

@@ -27,12 +27,12 @@ def test_every_profile_and_length_carries_blocks(overrides: tuple[str, ...]) -> 
     coder, rng = link.block_coder(), np.random.default_rng(1)
     for _ in range(5):
         block = rng.bytes(coder.block_bytes)
-        symbols = coder.symbols(block)
+        symbols = coder.encode_symbols(block)
         assert symbols.shape == (link.packet.frames, link.codebook.clusters)
         assert symbols.min() >= 0
         assert symbols.max() < len(link.codebook.codewords)
         air = bits_of_symbols(symbols, link.codebook.bits_per_symbol)
-        assert coder.block((4 - 8.0 * air).astype(np.float32)) == block
+        assert coder.decode_block((4 - 8.0 * air).astype(np.float32)) == block
 
 
 def test_a_text_that_is_not_utf8_is_one_line() -> None:

@@ -13,10 +13,10 @@ import pytest
 from evlcp_sdk.air.blocks import BlockError, Kind, Message
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, Countdown, CountdownKind, TimeKind
 from evlcp_sdk.errors import ConfigError, PluginWarning
-from evlcp_sdk.link.compose import compose, packets_of
+from evlcp_sdk.link.compose import compose, encode_messages
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import hookimpl
-from evlcp_sdk.plugin.records import message_kinds
+from evlcp_sdk.plugin.records import find_message_kinds
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.run import receive, receive_to_folder
 from evlcp_sdk.sim import load_scene
@@ -30,7 +30,7 @@ LINK = load_link(registry=REGISTRY)
 def test_a_kind_is_one_file_and_one_hook(tmp_path: Path) -> None:
     """What it does not understand is counted, as are its blocks where it is not installed."""
     symbols = compose(LINK, text="Tempo 30", other={"wind": (7.5, 270.0)}, transmitter_id=3, sequence=9)
-    symbols = np.concatenate([symbols, packets_of([Message(15, 3, 10, b"abc")], LINK.block_coder())])
+    symbols = np.concatenate([symbols, encode_messages([Message(15, 3, 10, b"abc")], LINK.block_coder())])
     scene = load_scene("drive-30kmh", {"duration_s": 0.16, "bars.start_chip": 1300.0})
     (bar,) = scene.bars
     sent = tuple(tuple(tuple(frame) for frame in packet) for packet in symbols.tolist())
@@ -97,6 +97,6 @@ def bring(number: int, name: str) -> object:
 def test_of_two_kinds_of_one_number_one_stays() -> None:
     registry = Registry.load(bring(9, "here"), bring(9, "there"))
     with pytest.warns(PluginWarning, match="number 9 or its name is that of"):
-        kinds = message_kinds(registry)
+        kinds = find_message_kinds(registry)
     assert len(kinds) == 7
     assert len(registry.broken) == 1

@@ -12,8 +12,8 @@ import pytest
 from evlcp_sdk.cli._receiving import LinkOptions
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, resolve
-from evlcp_sdk.link.several import alike_links, load_links, named_links
-from evlcp_sdk.link.shared import differences
+from evlcp_sdk.link.several import find_ambiguous_links, load_links, name_links
+from evlcp_sdk.link.shared import find_differences
 from evlcp_sdk.plugin.registry import Registry
 
 
@@ -74,7 +74,7 @@ def test_links_whose_characters_the_other_reads_are_named(tmp_path, capsys, rate
     ):
         (tmp_path / f"{name}.toml").write_text(text)
     files = [tmp_path / f"{name}.toml" for name in ("bar", "lamp", "other")]
-    assert alike_links(named_links(load_links(files))) == [("lamp", "other")] * alike
+    assert find_ambiguous_links(name_links(load_links(files))) == [("lamp", "other")] * alike
     # It is said on stderr before anything is read.
     LinkOptions([*map(str, files)]).load(Registry.load())
     message = "evlcp: warning: what one of the links 'lamp' and 'other' sends, the other may read"
@@ -114,8 +114,8 @@ def test_what_differs_is_named(table: dict[str, Any], keys: dict[str, Any]) -> N
         return f"{key}: sent with {json.dumps(table[section][name])}, received with {json.dumps(keys[key])}"
 
     messages = "error-correction" in table
-    assert differences(sent, ours, messages=messages) == tuple(map(named, keys))
-    assert not messages or differences(sent, ours) == ()
+    assert find_differences(sent, ours, messages=messages) == tuple(map(named, keys))
+    assert not messages or find_differences(sent, ours) == ()
 
 
 def test_another_revision_is_named() -> None:
@@ -123,7 +123,7 @@ def test_another_revision_is_named() -> None:
     codes = replace(link.codebook, codewords=other.codebook.codewords)
     newer = replace(link, codebook=codes, revisions={**link.revisions, "modulation": 9}, digest="0")
     reported = ('modulation.id = "wh4x2": sent with revision 9, received with revision 1',)
-    assert differences(newer, link) == reported
+    assert find_differences(newer, link) == reported
 
 
 def test_codes_that_differ_in_silence_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,7 +134,7 @@ def test_codes_that_differ_in_silence_are_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(WhPilots, "codes", lambda self, clusters: codes(self, clusters)[::-1].copy())
     theirs = resolve({})
     assert not np.array_equal(ours.codebook.pilots, theirs.codebook.pilots)
-    (result,) = differences(ours, theirs)
+    (result,) = find_differences(ours, theirs)
     assert result == 'pilots.id = "wh": sent with other codes than those received with'
 
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.link.several import named_links
+from evlcp_sdk.link.several import name_links
 from evlcp_sdk.live import Budget, Publisher
 from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.values import Fix, Frame
 
-LINKS = named_links(load_link())
+LINKS = name_links(load_link())
 PATIENT = Budget(waiting_ms=1e6, most_ms=1e7)
 """Nothing is left out, however slow the machine is."""
 

@@ -59,7 +59,7 @@ def test_two_algorithms_with_one_name_are_reported_when_asked_for(monkeypatch: p
     install(monkeypatch, *((owner, owner, partial(both.get, owner)) for owner in both))
     registry = Registry.load()
     assert registry.find("ranging", "centroid").distribution == "evlcp-sdk"
-    assert len(registry.installed("ranging")) == 3
+    assert len(registry.list_algorithms("ranging")) == 3
     with pytest.raises(PluginError, match=r"^two ranging algorithms named 'poc': one of ") as caught:
         registry.find("ranging", "poc")
     assert all(owner in str(caught.value) for owner in both)
@@ -119,8 +119,8 @@ def test_a_broken_plugin_is_left_out_and_reported(fault: str, monkeypatch: pytes
     assert (broken.plugin, broken.distribution) == ("bad", "evlcp-cam 1.0")
     assert reason in broken.reason
     assert "\n" not in str(broken)
-    assert [e.algorithm.id for e in registry.installed()] == ["poc"]
-    assert registry.plugins("evlcp_stage_finished") == []
+    assert [e.algorithm.id for e in registry.list_algorithms()] == ["poc"]
+    assert registry.plugins_with_hook("evlcp_stage_finished") == []
     with pytest.raises((PluginError, UnknownAlgorithmError)) as asked:
         registry.find("ranging", "mine")
     assert "plugin bad of evlcp-cam 1.0 is broken and left out" in str(asked.value)
@@ -134,10 +134,10 @@ def test_a_plugin_that_fails_when_asked_is_left_out_from_then_on() -> None:
     bad = plugin(evlcp_open_events=fail, evlcp_stage_finished=lambda stage: None)
     registry = Registry(bad, plugin(evlcp_open_events=lambda url: f"source of {url}"))
     with pytest.warns(PluginWarning, match=r"plugin \S+ is .*: evlcp_open_events\(\) fails: KeyError"):
-        answers = registry.ask("evlcp_open_events", url="cam:0")
+        answers = registry.call_hook("evlcp_open_events", url="cam:0")
     assert [answer for _, answer in answers] == ["source of cam:0"]
-    assert registry.plugins("evlcp_stage_finished") == []
-    assert registry.ask("evlcp_open_events", url="cam:0") == answers
+    assert registry.plugins_with_hook("evlcp_stage_finished") == []
+    assert registry.call_hook("evlcp_open_events", url="cam:0") == answers
 
 
 def adding(command: Callable[..., None], fails: bool = False) -> Callable[[], object]:

@@ -69,7 +69,7 @@ PERIOD_US = FORMAT.packet_chips * CHIP_US
 
 def packets_of(rng, n, book=BOOK, frames=FRAMES):
     """Chips of packets with random symbols, (chips, K)."""
-    symbols = rng.integers(0, book.carrying, (n, frames, book.clusters))
+    symbols = rng.integers(0, book.data_symbols, (n, frames, book.clusters))
     return np.concatenate([packet_chips(s, book) for s in symbols])
 
 

@@ -25,7 +25,7 @@ LAYOUTS = {
     "two lamps": ("bar.shape=table", "bar.leds=[[0, 0, 0, 0], [0.3, 0, 0, 1]]"),
     "three LEDs": ("bar.shape=table", "bar.leds=[[0, 0, 0, 0], [0.3, 0, 0, 1], [0, 0.2, 0, 2]]"),
 }
-RANGINGS = [entry.algorithm.id for entry in Registry.load().installed("ranging")]
+RANGINGS = [entry.algorithm.id for entry in Registry.load().list_algorithms("ranging")]
 
 
 def link_with(layout, *overrides):

@@ -10,7 +10,7 @@ import pytest
 from evlcp_sdk.errors import ConfigError, PluginError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
-from evlcp_sdk.plugin.records import installed_sinks
+from evlcp_sdk.plugin.records import find_sinks
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
@@ -21,7 +21,7 @@ from tests.unit.results.test_positions import packets
 
 
 def test_the_built_in_formats_come_by_the_same_hook() -> None:
-    sinks = installed_sinks(Registry.load())
+    sinks = find_sinks(Registry.load())
     assert {name for name, sink in sinks.items() if sink.record.default} == {
         *("frames", "packets", "fixes", "track", "geojson", "nmea")
     }

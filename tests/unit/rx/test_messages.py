@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from evlcp_sdk.air import signing
 from evlcp_sdk.air.beacons import Beacon
-from evlcp_sdk.air.blocks import Block, Kind, Message, split
+from evlcp_sdk.air.blocks import Block, Kind, Message, split_message
 from evlcp_sdk.air.signing import TrustedKey
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import MessageSpec
@@ -33,12 +33,12 @@ def packet_of(llr, number, transmitter=0, lost=()):
 
 def noisy(block, ber, rng):
     sigma = 1 / norm.isf(ber)
-    air = CODER.air_bits(block)
+    air = CODER.encode_bits(block)
     return 2 * (1 - 2.0 * air + rng.normal(0, sigma, air.size)) / sigma**2
 
 
 def blocks_of(*messages, digest=CODER.digest):
-    return [b.pack(CODER.block_bytes) for m in messages for b in split(m, digest, CODER.block_bytes)]
+    return [b.pack(CODER.block_bytes) for m in messages for b in split_message(m, digest, CODER.block_bytes)]
 
 
 class Operator:

@@ -106,7 +106,7 @@ def blocks_of(light: BarLight, packets: int) -> list[Block]:
     """What packets of a bar say."""
     coder, bits = light.link.block_coder(), light.link.codebook.bits_per_symbol
     sent = [bits_of_symbols(light.symbols(q), bits) for q in range(packets)]
-    return [Block.unpack(coder.block((4 - 8.0 * one).astype(np.float32)) or b"") for one in sent]
+    return [Block.unpack(coder.decode_block((4 - 8.0 * one).astype(np.float32)) or b"") for one in sent]
 
 
 def test_random_data_is_a_message_a_packet() -> None:
