@@ -1,4 +1,4 @@
-"""Loops over grid cells and over the times of events, and Cholesky's root of a few unknowns, compiled."""
+"""Compiled loops over grid cells and over the times of events, and Cholesky's root of a few unknowns."""
 
 from typing import Any
 
@@ -11,11 +11,12 @@ Array = NDArray[Any]
 
 
 @njit
-def take_in(observed: Array, prior: Array, out: Array) -> None:
-    """Probability of each cluster in each cell by Bayes' rule, from its evidence and from the place alone.
+def update_posterior(observed: Array, prior: Array, out: Array) -> None:
+    """Update the probability of each cluster in each cell by Bayes' rule: `out`.
 
-    All are (K, rows, columns). Without a cluster, the evidence is as likely as each with equal priors, and
-    not even a cell that fits a code in all its values is sure to show a cluster, nor a place.
+    `observed` is the probability by the evidence alone, `prior` that by the place alone; all are (K, rows,
+    columns). The evidence is as likely without a cluster as with each one at equal priors, and neither a cell
+    that fits a code in all its values nor a place is sure to show a cluster.
     """
     clusters, rows, columns = prior.shape
     # Flat, cells go side by side.
@@ -44,17 +45,19 @@ def take_in(observed: Array, prior: Array, out: Array) -> None:
 
 
 @njit
-def all_ordered(t_us: Array, x: Array, y: Array, width: int, height: int, origin: int, since: Array) -> bool:
-    """Whether no event is off the sensor or before its predecessor; times since an origin.
+def convert_ordered(
+    t_us: Array, x: Array, y: Array, width: int, height: int, origin_us: int, out: Array
+) -> bool:
+    """Convert times to those since an origin; False if an event is off the sensor or before its predecessor.
 
     Without a branch, so that it is quick.
     """
     backward = False
     if t_us.size:
-        since[0] = t_us[0] - origin
+        out[0] = t_us[0] - origin_us
     for i in range(1, t_us.size):
         backward |= t_us[i] < t_us[i - 1]
-        since[i] = t_us[i] - origin
+        out[i] = t_us[i] - origin_us
     # The farthest of many small numbers is found in a fraction of the time in which each is compared.
     right, low = np.uint16(0), np.uint16(0)
     for i in range(x.size):
@@ -65,7 +68,7 @@ def all_ordered(t_us: Array, x: Array, y: Array, width: int, height: int, origin
 
 
 @njit
-def sort_out(
+def judge_events(
     t_us: Array,
     x: Array,
     y: Array,
@@ -83,10 +86,11 @@ def sort_out(
         y: Rows, uint16 (n,).
         width: Columns of the sensor.
         height: Its rows.
-        limits: (longest pause, the same among those held, longest setback, events that agree, over how long,
-            most held, farthest time).
-        state: Time of the last kept, of the first and the last held, how many are held; int64 (4,), carried
-            on. How many becomes -1 where an event makes those held believed: it is the last one judged.
+        limits: (longest pause; longest pause among held events; longest setback; events that confirm a leap,
+            and the time they span; most held events; farthest time).
+        state: Time of the last kept event, of the first and the last held one, number of held ones; int64
+            (4,), updated. The number becomes -1 where an event confirms those held: it is the last one
+            judged.
         verdicts: Takes the verdicts, uint8 (n,).
 
     Returns:
@@ -135,7 +139,7 @@ def sort_out(
 
 @njit
 def median(values: Array, n: int) -> float:
-    """Median of the first n values. NumPy's takes three seconds to compile."""
+    """Median of the first n values; that of NumPy takes three seconds to compile."""
     some, middle, first, last = np.empty(n), n // 2, 0, n - 1
     for i in range(n):
         some[i] = values[i]
@@ -162,11 +166,11 @@ def median(values: Array, n: int) -> float:
 
 
 @njit
-def rooted(matrix: Array, damping: float, least: float, scale: Array, low: Array) -> bool:
-    """Cholesky's root of a symmetric matrix, scaled to a diagonal of 1 + `damping`; False if there is none.
+def factor_cholesky(matrix: Array, damping: float, least: float, scale: Array, low: Array) -> bool:
+    """Factor a symmetric matrix, scaled to a diagonal of 1 + `damping`, by Cholesky; False if it has no root.
 
-    `low` (n, n) is the root, below and on its diagonal, of the matrix scaled by `scale` (n,) on both sides.
-    There is none where less than `least` of a diagonal of 1 is left: that much is rounding.
+    `low` (n, n) takes the root, on and below its diagonal, of the matrix scaled by `scale` (n,) on both
+    sides. There is none where less than `least` of a diagonal of 1 is left: that much is rounding.
     """
     n = len(scale)
     for i in range(n):
@@ -190,8 +194,8 @@ def rooted(matrix: Array, damping: float, least: float, scale: Array, low: Array
 
 
 @njit
-def substituted(low: Array, scale: Array, side: Array, out: Array) -> None:
-    """Solve the equations whose root is `low`, as `rooted` gives it, for a right-hand side: `out` (n,)."""
+def solve_cholesky(low: Array, scale: Array, side: Array, out: Array) -> None:
+    """Solve the equations that `factor_cholesky` has factored for a right-hand side: `out` (n,)."""
     n = len(side)
     for i in range(n):
         value = side[i] * scale[i]
@@ -208,14 +212,14 @@ def substituted(low: Array, scale: Array, side: Array, out: Array) -> None:
 
 
 @njit
-def inverted(matrix: Array, least: float, out: Array) -> bool:
-    """The inverse of a positive matrix; False where it is singular, see `rooted`."""
+def invert_matrix(matrix: Array, least: float, out: Array) -> bool:
+    """Invert a positive definite matrix; False if it is singular, see `factor_cholesky`."""
     n = len(matrix)
     scale, low = np.zeros(n), np.zeros((n, n))
-    if not rooted(matrix, 0.0, least, scale, low):
+    if not factor_cholesky(matrix, 0.0, least, scale, low):
         return False
     for k in range(n):
         side = np.zeros(n)
         side[k] = 1.0
-        substituted(low, scale, side, out[k])
+        solve_cholesky(low, scale, side, out[k])
     return True

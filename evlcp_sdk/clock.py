@@ -1,8 +1,8 @@
-"""The clock that is believed, of files and cameras: which events are in order, where it leaps, and its steps.
+"""The clock of a file or camera: which events are in order, where the clock leaps, and the time steps on it.
 
-Clocks of cameras restart, and a flipped bit makes one leap. A leap is believed once enough events agree on
-it; until then they are held. Inside, time counts from the stream's first event and leaps are a few seconds
-long, so that no stage sees one and floating point is as fine late on a clock as early.
+Clocks of cameras restart, and a flipped bit makes one leap. A leap is confirmed once enough events agree on
+it; until then they are held. Stream time counts from the first event, with leaps of a few seconds only, so
+that no stage notices one and floating point is as fine late on a clock as early.
 """
 
 import math
@@ -18,44 +18,42 @@ from evlcp_sdk import _kernels
 from evlcp_sdk.values import Events, to_kernel_array
 
 LEAP_US = 1_000_000
-"""The longest pause that is believed at once: what was seen before a longer one is forgotten anyway."""
+"""The longest pause that needs no confirmation: what was seen before a longer one is forgotten anyway."""
 
 _SETBACK_US = 10_000
-"""Events so much earlier than others are in disorder; the clock catches up soon."""
+"""Events that are earlier by up to this are in disorder; the clock catches up soon."""
 
 _AGREE_EVENTS = 16
 _AGREE_US = 10_000
-"""How many events on end, over how long, make another clock believed: two TIME_HIGH words of EVT3."""
+"""Successive events, and the time they span, that confirm a leap: two TIME_HIGH words of EVT3."""
 
 _MOST_HELD = 1 << 20
-"""Events that are held; so many are believed whatever their time."""
+"""Most events that are held; so many confirm a leap whatever their time."""
 
 _BREAK_US = 4_000_000
-"""How much later a stream goes on inside after a leap: all that was seen before is forgotten by then."""
+"""Pause in stream time at a leap: all that was seen before is forgotten after it."""
 
 _MOST_BREAKS = 64
-"""Leaps that are remembered: packets come out long before so many more, at `_BREAK_US` each."""
+"""Leaps that are remembered: packets are complete long before so many more, at `_BREAK_US` each."""
 
 _FARTHEST_US = 1 << 62
-"""No event is further from 0."""
+"""Farthest time from 0 that an event may have."""
 
-_MOST_PIECES = 64
-"""Pieces of a time step that wait to be put together, but for one more in `_WHOLE_EVENTS`: small ones take
+_MOST_PIECES, _PIECE_EVENTS = 64, 4096
+"""Pieces of a time step that may wait to be joined, and one more for every so many events: small pieces take
 more memory than their events."""
 
-_WHOLE_EVENTS = 4096
-
 _LATER_US = 1 << 62
-"""When what is due later than in the open step is due."""
+"""Stands for any time after the open step."""
 
 _GRAINS = 24
-"""Differences of times that show how coarse these are: those of finer ones are all even in 1e-7 of cases."""
+"""Differences of times that show how coarse these are: those of finer times are all even in 1e-7 of cases."""
 
 _DROPPED = ("dropped_time_backward", "dropped_off_sensor", "dropped_time_doubtful")
-"""What events are counted as that are dropped, by the kernel's verdict on them."""
+"""Counts of dropped events, by the kernel's verdict on them."""
 
 _KEPT, _HELD = 3, 4
-"""Its verdicts on others."""
+"""The kernel's verdicts on other events."""
 
 
 class CameraClock:
@@ -64,22 +62,22 @@ class CameraClock:
     Args:
         width: Columns of the sensor.
         height: Its rows.
-        sparse: Pauses may be long, as in a file that somebody wrote: events ahead are held through them, and
-            given at the end where none contradicts.
+        is_sparse: Pauses may be long, as in a file that somebody wrote: events after a pause are held, and
+            given at the end unless others contradict them.
 
     Attributes:
-        last_us: Time of the newest event, inside, us; long ago before the first.
-        firsts: Of each count of what is dropped, the number of the first such event, from 0.
+        last_us: Stream time of the newest event, us; long ago before the first.
+        firsts: Number of the first event, from 0, of each count of dropped ones.
 
     >>> clock = CameraClock(1280, 720)
-    >>> [e.t_us.tolist() for e in clock.take(Events.of([70, 90, 80, 100], [1] * 4, [1] * 4, [1] * 4))]
+    >>> [e.t_us.tolist() for e in clock.feed(Events.of([70, 90, 80, 100], [1] * 4, [1] * 4, [1] * 4))]
     [[0, 20, 30]]
     >>> clock.camera_us(30.0), clock.counts["dropped_time_backward"]
     (100.0, 1)
     """
 
-    def __init__(self, width: int, height: int, *, sparse: bool = False) -> None:
-        self._sparse = sparse
+    def __init__(self, width: int, height: int, *, is_sparse: bool = False) -> None:
+        self._is_sparse = is_sparse
         self.last_us = -_FARTHEST_US
         self._size = width, height
         self._offset_us = 0
@@ -88,24 +86,24 @@ class CameraClock:
         # Camera clock of the last event kept; of the first and the last held; how many are held.
         self._state = np.zeros(4, np.int64)
         self._held: list[Events] = []
-        self._held_at = 0
+        self._first_held = 0
         self.firsts: dict[str, int] = {}
         self._counts = dict.fromkeys(("events", *_DROPPED, "clock_leaps", "clock_restarts"), 0)
 
     @property
     def counts(self) -> dict[str, int]:
-        """Events taken and dropped, and leaps forward and back that were believed."""
+        """Events fed and dropped, and confirmed leaps forward and back."""
         return dict(self._counts)
 
     def camera_us(self, t_us: float) -> float:
-        """The camera clock's time of a time inside, us."""
+        """Convert stream time to the camera's clock, us."""
         if len(self._offsets_us) == 1:
             return t_us + self._offset_us
-        at = max(bisect_right(self._starts_us, t_us) - 1, 0)
-        return t_us + self._offsets_us[at] if self._offsets_us else t_us
+        number = max(bisect_right(self._starts_us, t_us) - 1, 0)
+        return t_us + self._offsets_us[number] if self._offsets_us else t_us
 
-    def take(self, events: Events) -> list[Events]:
-        """Take the next events of the stream; give those that are kept, with their times inside."""
+    def feed(self, events: Events) -> list[Events]:
+        """Add the next events of the stream; return those that are kept, in stream time."""
         t_us, x, y, p = events.t_us, events.x, events.y, events.p
         self._counts["events"] += t_us.size
         if not t_us.size:
@@ -115,99 +113,101 @@ class CameraClock:
             t_us, x, y, p = to_kernel_array(t_us), to_kernel_array(x), to_kernel_array(y), to_kernel_array(p)
             events = Events.from_columns(t_us, x, y, p)
         if not self._starts_us:
-            first_us = self._first(events)
+            first_us = self._find_first_us(events)
             if first_us is None:
                 return []
-            self._begin(first_us, 0)
+            self._start_clock(first_us, 0)
         before_us, _, _, held = self._state.tolist()
         if not held and before_us <= int(t_us[0]) and int(t_us[-1]) - before_us <= LEAP_US:
-            inside_us = np.empty(t_us.size, np.int64)
-            if _kernels.all_ordered(t_us, x, y, *self._size, self._offset_us, inside_us):
+            stream_us = np.empty(t_us.size, np.int64)
+            if _kernels.convert_ordered(t_us, x, y, *self._size, self._offset_us, stream_us):
                 self._state[0] = t_us[-1]
-                self.last_us = int(inside_us[-1])
-                return [Events.from_columns(inside_us, x, y, p)]
-        return self._sorted(events)
+                self.last_us = int(stream_us[-1])
+                return [Events.from_columns(stream_us, x, y, p)]
+        return self._sort_events(events)
 
     def close(self) -> list[Events]:
-        """End the stream: what is still held is dropped, or given where that is sparse and ahead."""
-        if self._sparse and self._held and self._state[1] > self._state[0]:
-            return [self._leap()]
-        self._lose_held()
+        """End the stream; return the events still held after a pause that nothing contradicts."""
+        if self._is_sparse and self._held and self._state[1] > self._state[0]:
+            return [self._confirm_held()]
+        self._drop_held()
         self._state[3] = 0
         return []
 
-    def _lose_held(self) -> None:
-        """Drop what is held."""
+    def _drop_held(self) -> None:
         if self._held:
-            self._lose("dropped_time_doubtful", self._held_at, sum(map(len, self._held)))
+            self._count_dropped("dropped_time_doubtful", self._first_held, sum(map(len, self._held)))
         self._held = []
 
-    def _lose(self, name: str, first: int, many: int) -> None:
-        self._counts[name] += many
+    def _count_dropped(self, name: str, first: int, number: int) -> None:
+        self._counts[name] += number
         self.firsts[name] = min(self.firsts.get(name, first), first)
 
-    def _sorted(self, events: Events) -> list[Events]:
-        """The same, event by event."""
-        held_us = _FARTHEST_US if self._sparse else LEAP_US
+    def _count_dropped_where(self, name: str, mask: NDArray[np.bool_], first: int) -> None:
+        """Count dropped events; `first` is the number of the mask's first one."""
+        if mask.any():
+            self._count_dropped(name, first + int(mask.argmax()), int(np.count_nonzero(mask)))
+
+    def _sort_events(self, events: Events) -> list[Events]:
+        """Judge events one by one; return those that are kept, in stream time."""
+        held_us = _FARTHEST_US if self._is_sparse else LEAP_US
         limits = (LEAP_US, held_us, _SETBACK_US, _AGREE_EVENTS, _AGREE_US, _MOST_HELD, _FARTHEST_US)
-        given: list[Events] = []
+        pieces: list[Events] = []
         while len(events):
             verdicts = np.empty(len(events), np.uint8)
-            many, lost = _kernels.sort_out(
+            number, are_lost = _kernels.judge_events(
                 events.t_us, events.x, events.y, *self._size, limits, self._state, verdicts
             )
-            done, verdicts = events[:many], verdicts[:many]
-            events = events[many:]
-            if lost:
-                self._lose_held()
-            number = self._counts["events"] - len(events) - many
+            judged, verdicts = events[:number], verdicts[:number]
+            events = events[number:]
+            if are_lost:
+                self._drop_held()
+            first = self._counts["events"] - len(events) - number
             for verdict, name in enumerate(_DROPPED):
-                if (found := verdicts == verdict).any():
-                    self._lose(name, number + int(found.argmax()), int(np.count_nonzero(found)))
+                self._count_dropped_where(name, verdicts == verdict, first)
             if (kept := verdicts == _KEPT).any():
-                given.append(self._inside(done[kept]))
+                pieces.append(self._to_stream_time(judged[kept]))
             if (held := verdicts == _HELD).any():
                 if not self._held:
-                    self._held_at = number + int(held.argmax())
-                self._held.append(done[held])
+                    self._first_held = first + int(held.argmax())
+                self._held.append(judged[held])
             if self._state[3] < 0:
-                # The last one has made those held believed.
-                given.append(self._leap())
-        return given
+                # The last one has confirmed those that are held.
+                pieces.append(self._confirm_held())
+        return pieces
 
-    def _first(self, events: Events) -> int | None:
+    def _find_first_us(self, events: Events) -> int | None:
         """Time of the first event that has one and is on the sensor; those before it are dropped later."""
         width, height = self._size
         # As a rule, it is the very first.
         for some in (events[:1], events):
-            seen = (some.x < width) & (some.y < height)
-            good = seen & (some.t_us <= _FARTHEST_US) & (some.t_us >= -_FARTHEST_US)
+            on_sensor = (some.x < width) & (some.y < height)
+            good = on_sensor & (some.t_us <= _FARTHEST_US) & (some.t_us >= -_FARTHEST_US)
             if good.any():
                 return int(some.t_us[int(good.argmax())])
-        number = self._counts["events"] - len(events)
-        for name, lost in (("dropped_off_sensor", ~seen), ("dropped_time_doubtful", seen)):
-            if lost.any():
-                self._lose(name, number + int(lost.argmax()), int(np.count_nonzero(lost)))
+        first = self._counts["events"] - len(events)
+        self._count_dropped_where("dropped_off_sensor", ~on_sensor, first)
+        self._count_dropped_where("dropped_time_doubtful", on_sensor, first)
         return None
 
-    def _begin(self, camera_us: int, inside_us: int) -> None:
-        """The camera's clock stands at `camera_us` and goes on from there."""
-        self._offset_us = camera_us - inside_us
-        # What lies in the gap nearer to what comes is of it: a packet begins before its first event.
-        self._starts_us.append(inside_us - _BREAK_US // 2)
+    def _start_clock(self, camera_us: int, stream_us: int) -> None:
+        """Let the camera's clock go on from a time, at this stream time."""
+        self._offset_us = camera_us - stream_us
+        # The later half of the pause belongs to what comes: a packet begins before its first event.
+        self._starts_us.append(stream_us - _BREAK_US // 2)
         self._offsets_us.append(self._offset_us)
         self._state[0] = camera_us
 
-    def _leap(self) -> Events:
-        """Believe those that are held."""
+    def _confirm_held(self) -> Events:
+        """Let the clock leap to the events that are held; return them in stream time."""
         before_us, first_us, last_us, _ = self._state.tolist()
         self._counts["clock_leaps" if first_us > before_us else "clock_restarts"] += 1
-        self._begin(first_us, self.last_us + _BREAK_US)
+        self._start_clock(first_us, self.last_us + _BREAK_US)
         self._state[0], self._state[3] = last_us, 0
         held, self._held = Events.concat(self._held), []
-        return self._inside(held)
+        return self._to_stream_time(held)
 
-    def _inside(self, events: Events) -> Events:
+    def _to_stream_time(self, events: Events) -> Events:
         t_us = events.t_us - self._offset_us
         self.last_us = int(t_us[-1])
         return Events(t_us, events.x, events.y, events.p)
@@ -217,12 +217,12 @@ class TimeGrain(NamedTuple):
     """How coarse a stream's times are, by the first of their differences.
 
     Attributes:
-        step_us: Greatest common divisor of these, us: 1 but for coarse times.
-        seen: How many these are.
-        last_us: Time of the last event that was looked at; None before the first.
-        known_us: Time of the last that was needed; None as long as there are too few.
+        step_us: Greatest common divisor of these, us: 1 except for coarse times.
+        seen: Number of these.
+        last_us: Time of the last event; None before the first.
+        known_us: Time of the last event that was needed; None as long as there are too few.
 
-    >>> TimeGrain().after(np.arange(30) * 200).step_us
+    >>> TimeGrain().update(np.arange(30) * 200).step_us
     200
     """
 
@@ -231,13 +231,13 @@ class TimeGrain(NamedTuple):
     last_us: int | None = None
     known_us: int | None = None
 
-    def after(self, t_us: NDArray[np.int64]) -> "TimeGrain":
-        """With the next times of the stream."""
+    def update(self, t_us: NDArray[np.int64]) -> "TimeGrain":
+        """The grain with the next times of the stream."""
         if not t_us.size or self.known_us is not None:
             return self
-        apart = np.diff(t_us, prepend=t_us[0] if self.last_us is None else self.last_us)
-        places = np.flatnonzero(apart)[: _GRAINS - self.seen]
-        step_us = math.gcd(self.step_us, int(np.gcd.reduce(apart[places])) if len(places) else 0)
+        gaps_us = np.diff(t_us, prepend=t_us[0] if self.last_us is None else self.last_us)
+        places = np.flatnonzero(gaps_us)[: _GRAINS - self.seen]
+        step_us = math.gcd(self.step_us, int(np.gcd.reduce(gaps_us[places])) if len(places) else 0)
         seen = self.seen + len(places)
         return TimeGrain(step_us, seen, int(t_us[-1]), int(t_us[places[-1]]) if seen == _GRAINS else None)
 
@@ -251,33 +251,33 @@ class TimeStep(NamedTuple):
             the time before which all of its events are.
         events: Those in it, in order.
         after_gap: Steps in which nothing could happen were left out before it.
-        whole: It is no part: its events do not come again.
+        is_whole: It is no part: its events do not come again.
     """
 
     start_us: int
     end_us: int
     events: Events
     after_gap: bool
-    whole: bool = True
+    is_whole: bool = True
 
 
 class Timeline:
     """Cuts a stream into time steps on a fixed grid, whatever pieces it comes in.
 
-    A step is given once an event after it has been seen. Empty steps are given as long as somebody waits for
-    them, and left out in a gap. The part of a step before a time at which something is due is given as soon
-    as an event after that has been seen in the step, and once more with the whole step. Times are those
-    inside: see `CameraClock`.
+    A step is complete once an event after it has been seen. Empty steps are given as long as somebody waits
+    for them, and left out in a gap. The part of a step before a time at which something is due is given as
+    soon as an event after that has been seen in the step, and again with the whole step. Times are stream
+    times, see `CameraClock`.
 
     Args:
         step_us: Length of a step, us.
         width: Columns of the sensor.
         height: Its rows.
-        most_events: How many events a step may have.
+        most_events: Most events of a step.
 
     Attributes:
         dropped: Events beyond that, of all steps so far.
-        clock: What time it is, and which events are dropped.
+        clock: Converts times, and counts dropped events.
 
     >>> timeline = Timeline(1000, 1280, 720, most_events=100)
     >>> events = Events.of([100, 2500, 2600], x=[5, 5, 5], y=[7, 7, 7], p=[1, 0, 1])
@@ -290,7 +290,7 @@ class Timeline:
     def __init__(self, step_us: int, width: int, height: int, most_events: int) -> None:
         self.clock = CameraClock(width, height)
         self.dropped = 0
-        self._most, self._waiting = most_events, 0
+        self._most, self._pending_events = most_events, 0
         self._step_us, self._start_us = step_us, 0
         self._pending: list[Events] = []
         self._after_gap = False
@@ -298,86 +298,86 @@ class Timeline:
         self._due_us: int | None = None
 
     def feed(
-        self, events: Events, waiting: Callable[[], bool], due_us: Callable[[], float]
+        self, events: Events, is_waiting: Callable[[], bool], due_us: Callable[[], float]
     ) -> Iterator[TimeStep]:
-        """Take the next events of the stream; give the steps that they complete.
+        """Add the next events of the stream; yield the steps that they complete.
 
         Args:
             events: Those that the clock drops are in no step.
-            waiting: Says after a step whether the next one matters even if it is empty.
-            due_us: Says after a step, or a part, when something is due next, us; what it says changes with
-                these only.
+            is_waiting: Returns after a step whether the next one matters even if it is empty.
+            due_us: Returns after a step, or a part, when something is due next, us; it changes with these
+                only.
         """
-        for kept in self.clock.take(events):
+        for kept in self.clock.feed(events):
             t_us, done = kept.t_us, 0
-            for end in (*self._bounds(t_us), t_us.size):
+            for end in (*self._find_bounds(t_us), t_us.size):
                 while True:
                     if self._due_us is None:
                         due = due_us()
-                        within = max(self._start_us, self._part_us) < due < self._start_us + self._step_us
-                        self._due_us = math.ceil(due) if within else _LATER_US
+                        is_in_step = max(self._start_us, self._part_us) < due < self._start_us + self._step_us
+                        self._due_us = math.ceil(due) if is_in_step else _LATER_US
                     if not end or t_us[end - 1] < self._due_us:
                         break
                     part = done + int(t_us[done:end].searchsorted(self._due_us))
                     self._part_us, self._due_us = self._due_us, None
-                    yield self._so_far(kept[done:part])
-                self._keep(kept[done:end])
+                    yield self._make_part(kept[done:part])
+                self._add_pending(kept[done:end])
                 done = end
                 if end < t_us.size:
-                    yield self._next()
+                    yield self._finish_step()
                     next_us = int(t_us[end]) // self._step_us * self._step_us
-                    while self._start_us < next_us and waiting():
-                        yield self._next()
+                    while self._start_us < next_us and is_waiting():
+                        yield self._finish_step()
                     if self._start_us < next_us:
                         self._start_us, self._after_gap = next_us, True
 
     def close(self) -> Iterator[TimeStep]:
-        """End the stream; give the step that it ends in, if there is one."""
+        """End the stream; yield the step that it ends in, if there is one."""
         self.clock.close()
         if self._pending:
-            yield self._next(self.clock.last_us)
+            yield self._finish_step(self.clock.last_us)
 
-    def _bounds(self, t_us: NDArray[np.int64]) -> list[int]:
-        """Where each new time step starts among events, which are in order and not none."""
+    def _find_bounds(self, t_us: NDArray[np.int64]) -> list[int]:
+        """Where new time steps start among events, which are in order and at least one."""
         start_us, step_us = self._start_us, self._step_us
         first_us = max(int(t_us[0]) // step_us * step_us, start_us)
         last_us = int(t_us[-1])
         if last_us - first_us > step_us * t_us.size:
-            # Sparse events: look at each instead of at each step.
+            # Sparse events: visit each instead of each step.
             step = t_us // step_us
             return np.flatnonzero(np.diff(step, prepend=start_us // step_us) > 0).tolist()
-        # Steps before the first event of these are not looked at, however many there are.
+        # Steps before the first of these events are not visited, however many there are.
         next_us = first_us + step_us * (first_us == start_us)
         if next_us > last_us:
             return []
         return sorted(set(t_us.searchsorted(np.arange(next_us, last_us + 1, step_us)).tolist()))
 
-    def _so_far(self, newest: Events) -> TimeStep:
-        """The part of the open step whose end is due: what is kept of it, and what is not yet."""
+    def _make_part(self, newest: Events) -> TimeStep:
+        """The part of the open step that is due: its pending events and the newest ones."""
         if len(self._pending) > 1:
             self._pending = [Events.concat(self._pending)]
         # A view where it is all of one piece: the whole step is one, too.
-        newest = newest[: self._most - self._waiting]
+        newest = newest[: self._most - self._pending_events]
         events = Events.concat([*self._pending, newest]) if self._pending else newest
-        return TimeStep(self._start_us, self._part_us, events, self._after_gap, whole=False)
+        return TimeStep(self._start_us, self._part_us, events, self._after_gap, is_whole=False)
 
-    def _keep(self, events: Events) -> None:
-        """Add events to the step that is open, as far as it has room."""
-        many, room = events.t_us.size, self._most - self._waiting
-        if many > room:
-            self.dropped += many - room
-            events, many = events[:room], room
-        if not many:
+    def _add_pending(self, events: Events) -> None:
+        """Add events to the open step, as far as it has room."""
+        number, room = events.t_us.size, self._most - self._pending_events
+        if number > room:
+            self.dropped += number - room
+            events, number = events[:room], room
+        if not number:
             return
-        self._waiting += many
+        self._pending_events += number
         self._pending.append(events)
-        if len(self._pending) > _MOST_PIECES + self._waiting // _WHOLE_EVENTS:
+        if len(self._pending) > _MOST_PIECES + self._pending_events // _PIECE_EVENTS:
             self._pending = [Events.concat(self._pending)]
 
-    def _next(self, end_us: int | None = None) -> TimeStep:
-        """The step whose events are pending; `end_us` where the stream ends inside it."""
+    def _finish_step(self, end_us: int | None = None) -> TimeStep:
+        """Finish the open step; `end_us` where the stream ends in it."""
         events = self._pending[0] if len(self._pending) == 1 else Events.concat(self._pending)
         start_us, after_gap = self._start_us, self._after_gap
-        self._pending, self._waiting, self._after_gap, self._due_us = [], 0, False, None
+        self._pending, self._pending_events, self._after_gap, self._due_us = [], 0, False, None
         self._start_us += self._step_us
         return TimeStep(start_us, self._start_us if end_us is None else end_us, events, after_gap)

@@ -441,7 +441,7 @@ def _run(
     pieces = iter(pieces)
     first_us = last_us = None
     watch = Stopwatch()
-    with watch.running():
+    with watch.measure():
         try:
             while True:
                 try:

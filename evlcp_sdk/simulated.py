@@ -41,11 +41,11 @@ class SimulatedSource(EventSource):
 
     @property
     def truth(self) -> Truth:
-        """What was sent and where the bars are, all of the scene whether it has been read or not."""
+        """What was sent and where the bars are, in the whole scene whether it has been read or not."""
         return truth_of(self.simulation)
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """Render on until there are events; return them, or None at the scene's end."""
+        """Render on until there are events, and return them; None at the scene's end."""
         events = next(self._pieces, None)
         return None if events is None else (events, Triggers.empty())
 
@@ -54,14 +54,14 @@ class SimulatedSource(EventSource):
         self._pieces = iter(())
 
     def save(self, path: Path | str, advance: Advance | None = None) -> tuple[Path, ...]:
-        """Render the scene into a recording with its truth beside it; return the files that were written.
+        """Render the scene into a recording with its truth; return the files that were written.
 
         `NAME.raw` (EVT3) and `NAME.truth.json`; of a scene on earth also `NAME.site.toml`, where its bars
         stand, and `NAME.attitude.csv`, what an IMU measures. They come into place together, the truth last.
 
         Args:
             path: `NAME.raw`.
-            advance: Called after every piece with the seconds of the scene that are rendered.
+            advance: Called after every piece with the seconds of the scene rendered so far.
 
         Raises:
             StreamError: Events of the source have been taken already.
@@ -81,17 +81,17 @@ class SimulatedSource(EventSource):
                     writer.write(events)
                     if advance is not None:
                         advance(simulation.done_s)
-            beside = _on_earth(simulation, out)
-            for path, text in beside.items():
+            survey = _survey_files(simulation, out)
+            for path, text in survey.items():
                 outputs.write_text(text, path)
             size = outputs.path(out).stat().st_size
             outputs.write_text(json.dumps(self.truth.to_table() | {"bytes": size}), truth_file)
             outputs.commit()
-        return (out, truth_file, *beside)
+        return (out, truth_file, *survey)
 
     @property
     def counts(self) -> dict[str, int]:
-        """Events given out so far, and what the sensor did: its events, those dropped, those of light."""
+        """Events given out so far, and the sensor's counts: its events, those dropped, those of light."""
         return super().counts | {
             f"simulated_{name}": number for name, number in self.simulation.counts.items()
         }
@@ -103,16 +103,16 @@ class SimulatedSource(EventSource):
         return f"SimulatedSource({scene.name}, {bars}, {scene.duration_s:g} s, seed {scene.seed})"
 
 
-def _on_earth(simulation: Simulation, out: Path) -> dict[Path, str]:
-    """The files that say where the bars stand and how the camera does, if the scene says so."""
+def _survey_files(simulation: Simulation, out: Path) -> dict[Path, str]:
+    """Files with the sites of the bars and the camera's attitude, text by path; none off the earth."""
     scene = simulation.scene
     if scene.world is None:
         return {}
-    found = {out.with_suffix(".site.toml"): to_toml(surveyed_sites(scene, scene.seed))}
+    files = {out.with_suffix(".site.toml"): to_toml(surveyed_sites(scene, scene.seed))}
     log = attitude_log(scene, scene.seed, simulation.path)
     if log is not None:
-        found[out.with_suffix(".attitude.csv")] = log.to_csv()
-    return found
+        files[out.with_suffix(".attitude.csv")] = log.to_csv()
+    return files
 
 
 def simulate(
@@ -126,10 +126,9 @@ def simulate(
     """Render a scene as a source of events, with its truth.
 
     Args:
-        scene: A preset's name, a `scene.toml`, its table, or a scene that is loaded.
-        seed: Of everything random, instead of the scene's.
-        link: What the bars send with, a link or a `link.toml`, instead of the scene's link; of a preset or a
-            file.
+        scene: A preset's name, a `scene.toml`, its table, or a loaded scene.
+        seed: Seed of everything random, instead of the scene's.
+        link: A link or a `link.toml` that the bars send with, instead of the scene's; of a preset or a file.
         overrides: What `--set` takes, e.g. `"motion.distance_m=70"`, or a mapping from key to value; of a
             preset or a file.
         threads: Threads that share the pixels; the events do not depend on it.

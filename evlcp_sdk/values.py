@@ -252,7 +252,7 @@ class PresenceMap:
         if self.prior is None:
             return self
         probability = np.empty_like(self.probability)
-        _kernels.take_in(self.probability, self.prior, probability)
+        _kernels.update_posterior(self.probability, self.prior, probability)
         return replace_fields(self, probability=probability)
 
     def __repr__(self) -> str:

@@ -82,7 +82,7 @@ class ReadoutTally:
         """Count events, in pieces of any size."""
         if not len(events):
             return
-        self.grain = self.grain.after(events.t_us)
+        self.grain = self.grain.update(events.t_us)
         t_us = events.t_us
         first, last = int(t_us[0]) // 1000, int(t_us[-1]) // 1000
         if 0 <= last - first < len(t_us) // 8:

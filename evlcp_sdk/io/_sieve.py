@@ -31,7 +31,7 @@ class Sieve:
 
     def __init__(self, unit: str, width: int | None, height: int | None) -> None:
         self._unit = unit
-        self._clock = CameraClock(width or 1 << 16, height or 1 << 16, sparse=True)
+        self._clock = CameraClock(width or 1 << 16, height or 1 << 16, is_sparse=True)
         self._firsts: dict[str, int] = {}
         self._row_offset = 0
 
@@ -44,7 +44,7 @@ class Sieve:
         """
         # A heading and empty lines are no events.
         self._row_offset = first - self._clock.counts["events"]
-        return self._restore_times(self._clock.take(events))
+        return self._restore_times(self._clock.feed(events))
 
     def close(self) -> Events:
         """End the stream; return the events still held back that nothing contradicts."""

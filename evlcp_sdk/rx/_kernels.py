@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk._kernels import inverted, median
+from evlcp_sdk._kernels import invert_matrix, median
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -1520,7 +1520,7 @@ def fit_newest(
                 likely[a, b] = normal[a, b]
         likely[1, 1] += speed_weight
         likely[2, 2] += curvature_weight
-        inverted(likely, _ROUNDING, inverse)
+        invert_matrix(likely, _ROUNDING, inverse)
         free, counted = float(n), 0.0
         for a in range(3):
             path[a] = 0.0
@@ -1560,7 +1560,7 @@ def _solve_parabola(
                     right[k, a] += terms[a] * off[k, i]
                 for b in range(3):
                     normal[a, b] += weight[i] * terms[a] * terms[b]
-    return (n if n > 3 and inverted(normal, _ROUNDING, inverse) else 0), lightest
+    return (n if n > 3 and invert_matrix(normal, _ROUNDING, inverse) else 0), lightest
 
 
 @njit

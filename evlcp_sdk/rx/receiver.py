@@ -206,7 +206,7 @@ class Receiver:
 
     def _run(self, step: TimeStep) -> list[Packet]:
         """Give each link a time step; give the packets that are complete, of the links that fit."""
-        if not step.whole:
+        if not step.is_whole:
             for one in self._receivers:
                 one.framing.decode_early(step)
             return []

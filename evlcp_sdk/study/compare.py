@@ -146,7 +146,7 @@ class _Lane:
 
     def feed(self, events: Events | None) -> None:
         """Take events; None ends the stream."""
-        with self.spent.running():
+        with self.spent.measure():
             packets = self.receiver.close() if events is None else self.receiver.feed(events)
         self.packets += len(packets)
         self.frames += frames_of(packets)
@@ -222,7 +222,7 @@ def _timed(pieces: Iterator[Events], watch: Stopwatch) -> Iterator[Events | None
     """The same pieces, and None at the end; the time that it takes to get them counted."""
     piece: Events | None = Events.empty()
     while piece is not None:
-        with watch.running():
+        with watch.measure():
             piece = next(pieces, None)
         yield piece
 

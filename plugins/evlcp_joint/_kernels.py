@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk._kernels import median, rooted, substituted
+from evlcp_sdk._kernels import factor_cholesky, median, solve_cholesky
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -545,9 +545,9 @@ def solve(
     damping = 1e-3
     outside = False
     for _ in range(_STEPS):
-        if not rooted(normal, damping, ROUNDING, scale, factor):
+        if not factor_cholesky(normal, damping, ROUNDING, scale, factor):
             return False
-        substituted(factor, scale, right, move)
+        solve_cholesky(factor, scale, right, move)
         for a in range(FITTED):
             new_fit[a] = fit[a] + move[a]
             if not np.isfinite(new_fit[a]):
@@ -612,11 +612,11 @@ def assess_fit(by_boundary: Array, scores: Array, normal: Array) -> tuple[float,
     """
     inverse, scale, unit = np.empty(FITTED), np.empty(FITTED), np.zeros(FITTED)
     factor = np.empty((FITTED, FITTED))
-    if not rooted(normal, 0.0, ROUNDING, scale, factor):
+    if not factor_cholesky(normal, 0.0, ROUNDING, scale, factor):
         return np.nan, 0, 0.0
     # The spacing's row of the inverse: one column of it, as that is symmetric.
     unit[0] = 1.0
-    substituted(factor, scale, unit, inverse)
+    solve_cholesky(factor, scale, unit, inverse)
     by_row, rows = 0.0, 0
     for v in range(len(scores)):
         part = 0.0

@@ -187,7 +187,7 @@ class CharacterDecoder:
         # Times rise: none is before the grid.
         inside = ticks >= 0
         np.add.at(counts, (p[inside].astype(np.int64), ticks[inside]), 1)
-        return replace(state, first=first, counts=counts, grain=state.grain.after(t_us))
+        return replace(state, first=first, counts=counts, grain=state.grain.update(t_us))
 
     def _decode(
         self, state: CharacterState, due: int, last: bool = False

@@ -141,7 +141,7 @@ def _count(at: Floats, p: NDArray[np.uint8], block: int) -> NDArray[np.int32]:
 
 def _find_rates(t_us: Ticks, p: NDArray[np.uint8]) -> Iterator[float]:
     """The lowest frequencies of which the highest lines in the spectrum of edges are multiples, Hz."""
-    step_us = max(TimeGrain().after(t_us).step_us, 1)
+    step_us = max(TimeGrain().update(t_us).step_us, 1)
     # Whole steps: others would beat with them.
     bin_us = step_us * max(_BIN_US // step_us, 1)
     counts = _count((t_us - t_us[0]) / bin_us, p, 2)[:, :_MOST_BINS]

@@ -95,7 +95,7 @@ def rows(events: Events) -> list[Row]:
 
 def take_in_pieces(events: Events, cuts: list[int]) -> tuple[list[Row], CameraClock]:
     clock = CameraClock(WIDTH, HEIGHT)
-    pieces = [e for a, b in pairwise([0, *cuts, len(events)]) for e in clock.take(events[a:b])]
+    pieces = [e for a, b in pairwise([0, *cuts, len(events)]) for e in clock.feed(events[a:b])]
     clock.close()
     return [row for e in pieces for row in rows(e)], clock
 
@@ -131,10 +131,10 @@ def test_a_clock_that_others_agree_on_is_believed_and_nothing_is_lost(leap_us: i
 
 def test_what_is_held_is_bounded() -> None:
     clock = CameraClock(WIDTH, HEIGHT)
-    clock.take(even(10**12))
+    clock.feed(even(10**12))
     still = Events.of(np.full(1 << 19, 7), *np.zeros((3, 1 << 19)))
-    assert clock.take(still) == []
-    assert sum(map(len, clock.take(still))) == 1 << 20
+    assert clock.feed(still) == []
+    assert sum(map(len, clock.feed(still))) == 1 << 20
     assert clock.counts["clock_restarts"] == 1
 
 
@@ -217,7 +217,7 @@ def test_a_part_of_a_step_comes_when_it_is_due(seed: int, cuts: list[int], dues:
     # Nothing is due in a gap, in which nobody waits.
     dues_us = sorted(due for due in dues if due // STEP_US * STEP_US in starts_us)
     given_, _ = steps_of(events, cuts, dues_us=dues_us)
-    assert plain([s for s in given_ if s.whole]) == plain(steps)
+    assert plain([s for s in given_ if s.is_whole]) == plain(steps)
     # The last step ends with the stream, and may have parts, too.
     want = []
     for step in steps:
@@ -225,7 +225,7 @@ def test_a_part_of_a_step_comes_when_it_is_due(seed: int, cuts: list[int], dues:
         for due in dues_us:
             if step.start_us < due < step.start_us + STEP_US and any(t >= due for t, *_ in within):
                 want.append((step.start_us, due, [row for row in within if row[0] < due]))
-    assert [(s.start_us, s.end_us, rows(s.events)) for s in given_ if not s.whole] == want
+    assert [(s.start_us, s.end_us, rows(s.events)) for s in given_ if not s.is_whole] == want
 
 
 def test_a_stream_without_events_has_no_steps() -> None:

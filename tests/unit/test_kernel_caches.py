@@ -102,7 +102,7 @@ def test_time_for_kernels_is_left_out() -> None:
     watch, stats = Stopwatch(), SimpleNamespace(cache_misses={})
     inner = COMPILE_TIMER.watch(SimpleNamespace(compile=lambda _: busy(0.05), stats=stats))
     outer = COMPILE_TIMER.watch(SimpleNamespace(compile=lambda sig: (busy(0.05), inner(sig)), stats=stats))
-    with watch.running():
+    with watch.measure():
         began_s = time.perf_counter()
         outer(None)
         took_s = time.perf_counter() - began_s
