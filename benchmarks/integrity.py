@@ -121,7 +121,7 @@ def scene(world: World, rng: np.random.Generator) -> Scene:
     focal_mm = CAMERA.focal_mm * (1 + world.focal * rng.normal())
     true = replace(CAMERA, focal_mm=focal_mm)
     depth = rng.uniform(30, 90)
-    views, vibration_px = [], rng.normal(0, SPEC.shaken_sigma_px, 2)
+    views, vibration_px = [], rng.normal(0, SPEC.vibration_sigma_px, 2)
     # Thirds of the image's width, so that no two bars cover each other.
     slots = rng.permutation(3)[: world.bars]
     for number, slot in enumerate(slots):
@@ -217,7 +217,7 @@ def point_information(seen: Scene) -> Floats:
         away = points - np.array(seen.camera.centre_px)
         rows[:, :, 6] = away * WRONG_FOCAL
         rows[:, :, 7] = away * seen.sigma.focal_mm / seen.camera.focal_mm
-        rows[:, :, 8:10] = SPEC.shaken_sigma_px * np.eye(2)
+        rows[:, :, 8:10] = SPEC.vibration_sigma_px * np.eye(2)
         own = rows[:, :, 10 + 9 * b : 19 + 9 * b]
         own[:, :, :2] = own_shift(view.points_px, SPEC)
         own[:, :, 2] = math.hypot(length, SPEC.stretch_share) * np.einsum("nij,nj->ni", by, arm)
@@ -392,7 +392,7 @@ def drive(world: World, rng: np.random.Generator, spec: ErrorModel) -> tuple[lis
     root, sigma = np.linalg.cholesky(power), CameraSigma(focal_mm=world.focal * CAMERA.focal_mm)
     fixes, places = [], []
     for step in range(STEPS):
-        views, vibration_px = [], rng.normal(0, spec.shaken_sigma_px, 2)
+        views, vibration_px = [], rng.normal(0, spec.vibration_sigma_px, 2)
         for number, (stands, stated, slow) in enumerate(bars):
             slow[:] = fade * slow + math.sqrt(1 - fade**2) * rng.normal(0, PIXEL_PX, (16, 2))
             points, _ = project_bars(stands, state[:3], rotation, true)

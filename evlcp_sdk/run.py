@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.place.bar_registry import BarRegistry
-    from evlcp_sdk.place.calibration import Calibrated, CalibrationView, KnownPose
+    from evlcp_sdk.place.calibration import CalibrationResult, CalibrationView, KnownPose
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.place.observations import BarView
     from evlcp_sdk.place.survey import SurveyedBar
@@ -593,7 +593,7 @@ def calibrate(
     registry: Registry | None = None,
     limit_px: float = 2.0,
     name: str = "poses",
-) -> Calibrated:
+) -> CalibrationResult:
     """Estimate focal length, principal point and distortion from bars at known places.
 
     `recordings` show bars that stand at `sites`; `poses` say where the camera was, and when, and `name` is
@@ -606,7 +606,7 @@ def calibrate(
             was seen.
     """
     from evlcp_sdk.place.bar_registry import BarRegistry
-    from evlcp_sdk.place.calibration import calibrate as fit_camera
+    from evlcp_sdk.place.calibration import fit_camera
     from evlcp_sdk.place.error_model import ErrorModel
     from evlcp_sdk.scene.sites import LocalAxes
 
@@ -619,12 +619,12 @@ def calibrate(
     for url in recordings:
         who = BarRegistry(sites, link.position)
         seen, _ = _seen_at(url, poses, {"": link}, registry, who, name)
-        for how in who.contradicted.values():
+        for how in who.contradictions.values():
             raise ConfigError(f"{url}: {how}")
         for pose, points in seen:
             bars = []
             for number, found in points.items():
-                if (site := who.stands_at.get(number)) is not None:
+                if (site := who.known_sites.get(number)) is not None:
                     enu = site.layout_positions_m(link.bar, axes)
                     bars.append(
                         replace(found, transmitter=site.transmitter_id, enu_m=enu, survey=site.survey_sigmas)
@@ -671,14 +671,14 @@ def _seen_at(
     who: BarRegistry,
     source: str,
 ) -> tuple[list[tuple[KnownPose, dict[int, BarView]]], dict[int, str]]:
-    """The poses of a recording with what `points_at` gives of each transmitter then; the link of each.
+    """The poses of a recording with the view of each transmitter then; the link of each transmitter.
 
     Raises:
         InputError: The recording cannot be read.
         ConfigError: No pose is of a time at which bars are in view.
     """
     from evlcp_sdk.place.error_model import ErrorModel
-    from evlcp_sdk.place.points import points_at
+    from evlcp_sdk.place.points import interpolate_points
 
     poses = [pose for pose in poses if pose.recording in ("", Path(url).name)]
     placing = select_positioning_links(links)
@@ -710,7 +710,8 @@ def _seen_at(
             name = link_of[number]
             link = placing[name]
             errors = ErrorModel.of(link.position)
-            points = points_at(number, seen, pose.t_us, periods[name], link.bar.cluster_positions_m(), errors)
+            layout_m = link.bar.cluster_positions_m()
+            points = interpolate_points(number, seen, pose.t_us, periods[name], layout_m, errors)
             if points is not None:
                 found[-1][1][number] = points
     times = [pose.t_us for pose in poses]
@@ -743,7 +744,7 @@ def survey(
     """
     from evlcp_sdk.place.bar_registry import BarRegistry
     from evlcp_sdk.place.error_model import ErrorModel
-    from evlcp_sdk.place.survey import survey as survey_bars
+    from evlcp_sdk.place.survey import survey_bars
     from evlcp_sdk.scene.sites import LocalAxes
 
     registry = Registry.load() if registry is None else registry
@@ -780,7 +781,7 @@ def survey(
         replace(bar, site=replace(bar.site, link=sends[bar.site.transmitter_id] or None)) for bar in surveyed
     ]
     sites = [bar.site for bar in named]
-    said = {id_: how for who in registries for id_, how in who.contradicted_by(sites).items()}
+    said = {id_: how for who in registries for id_, how in who.find_contradictions(sites).items()}
     return [replace(bar, contradicted=said.get(bar.site.transmitter_id, "")) for bar in named]
 
 
@@ -831,20 +832,20 @@ def _own_poses(
     saw.
     """
     from evlcp_sdk.place.navigator import Navigator
-    from evlcp_sdk.place.survey import OwnPoses
+    from evlcp_sdk.place.survey import TrackPoses
     from evlcp_sdk.scene.attitude import attitude_source
 
     navigator = Navigator(select_positioning_links(name_links(links)), plan, attitude)
-    own = OwnPoses(navigator, attitude_source(attitude), Path(url).name)
+    track = TrackPoses(navigator, attitude_source(attitude), Path(url).name)
     taken: dict[int, BarSite] = {}
     with receive(url, links, registry=registry, attitude=attitude) as packets:
         for packet in packets:
-            own.take(packet)
-            taken = navigator.positioner.bars.stands_at | taken
-    poses, ids = own.close(), navigator.positioner.bars.ids
+            track.add_packet(packet)
+            taken = navigator.positioner.bars.known_sites | taken
+    poses, ids = track.close(), navigator.positioner.bars.ids
     wrong = [n for n, site in taken.items() if ids.get(n, site.transmitter_id) != site.transmitter_id]
     if not wrong:
-        return poses, list(taken.values()), own.summary
+        return poses, list(taken.values()), track.summary
     # A new bar was taken for a known one as long as it had not sent its id: its number is no site's.
     numbers = {said: number for number, said in ids.items()}
     none = max(ids) + 1

@@ -624,8 +624,8 @@ class Fix:
         refusal: Kind of refusal; empty for a fix that is given.
         detail: The refusal in words.
         standing: The rest of the covariance by its causes, as the position's shifts by one sigma of each
-            standing error, m, float64 (3, k): `camera`, `attitude`, `bar N` and `doubt`, as a `Pose` has
-            them.
+            standing error, m, float64 (3, k): `camera`, `attitude`, `bar N` and `attitude-excess`, as in a
+            `Pose`.
         misfit: Mean square of the residuals in sigmas, over the degrees of freedom.
         freedom: Degrees of freedom; 0 where the fix is refused.
         hpl_m: Horizontal protection level: the error exceeds it with the probability `position.risk`, even
@@ -641,7 +641,8 @@ class Fix:
         suspects: Of a fix refused as `misfit`, the parts that would each explain it if left out.
         weakest_axis: The direction in which the position is least certain, a unit vector, float64 (3,); 0
             where it is not known.
-        standing_slope: Change of `standing`, but for `doubt`, a metre along this axis, float64 (3, k).
+        standing_slope: Change of `standing`, but for `attitude-excess`, a metre along this axis, float64
+            (3, k).
         undetected_m: Largest shift by one wrong part whose test just passed: east, north, up, m, float64
             (3,); infinite where there is no protection level.
         failed: The bar that was left out; None where none was.

@@ -12,7 +12,7 @@ from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, print_json
 from evlcp_sdk.suggestions import format_count
 
 if TYPE_CHECKING:
-    from evlcp_sdk.place.calibration import Calibrated
+    from evlcp_sdk.place.calibration import CalibrationResult
 
 
 def calibrate(
@@ -61,19 +61,19 @@ def calibrate(
         console().print(_toml(found, len(known)))
 
 
-def _table(found: Calibrated) -> dict[str, Any]:
+def _table(found: CalibrationResult) -> dict[str, Any]:
     return {
         "camera": {name: getattr(found.camera, name) for name in found.sigma},
         "sigma": dict(found.sigma),
         "camera_sigma": asdict(found.camera_sigma),
-        "not_determined_corner_px": dict(found.refused),
+        "not_determined_corner_px": dict(found.undetermined_px),
         "views": found.views,
         "points": found.points,
         "misfit": found.misfit,
     }
 
 
-def _toml(found: Calibrated, poses: int) -> str:
+def _toml(found: CalibrationResult, poses: int) -> str:
     """The tables `[camera]` and `[camera_sigma]`; as comments what was not determined."""
     lines = [
         f"# {format_count(found.views, 'view')}, {format_count(found.points, 'point')},"
@@ -83,7 +83,7 @@ def _toml(found: Calibrated, poses: int) -> str:
     ]
     for name, sigma in found.sigma.items():
         lines.append(f"{name} = {getattr(found.camera, name):.8g}  # +- {sigma:.2g}")
-    for name, corner in found.refused.items():
+    for name, corner in found.undetermined_px.items():
         lines.append(
             f"# {name}: not determined (the image's corners move by {corner:.1f} px within its sigma)"
         )

@@ -382,7 +382,7 @@ class PositionTally:
     def to_dict(self, navigator: Navigator) -> dict[str, Any]:
         """The figures as JSON values, with what is known of the bars in the end."""
         positioner = navigator.positioner
-        axes = positioner.axes
+        axes, offset_m = positioner.axes, navigator.gnss_offset_m
         return {
             "fixes": self.given,
             "fixes_verified": self.verified,
@@ -391,19 +391,19 @@ class PositionTally:
             "alarms": dict(sorted(self.alarms.items())),
             "excluded": dict(sorted(self.excluded.items())),
             "suspects": dict(sorted(self.suspects.items())),
-            "focal_mm_fits": round_or_none(positioner.fitting_focal_mm(), 2),
+            "focal_mm_fits": round_or_none(positioner.search_focal_mm(), 2),
             "left_out_of_track": self.left_out,
             **navigator.counts,
-            "gnss_apart_m": None if navigator.apart_m is None else navigator.apart_m.round(3).tolist(),
+            "gnss_apart_m": None if offset_m is None else offset_m.round(3).tolist(),
             "frames_late": positioner.counts["frames_late"],
             "beacons_forged": positioner.counts["beacons_forged"],
-            "sites_contradicted": {str(n): how for n, how in positioner.bars.contradicted.items()},
-            "learnt": [_learnt_row(one) for one in navigator.estimated_biases()],
+            "sites_contradicted": {str(n): how for n, how in positioner.bars.contradictions.items()},
+            "learnt": [_learnt_row(one) for one in navigator.estimate_biases()],
             "origin": asdict(axes) if axes is not None else None,
-            "bars_exact": [n for n, s in positioner.bars.stands_at.items() if s.position_sigma_m is None],
+            "bars_exact": [n for n, s in positioner.bars.known_sites.items() if s.position_sigma_m is None],
             "heard": {str(n): one for n, one in sorted(positioner.bars.ids.items())},
-            "sites_unseen": [site.transmitter_id for site in positioner.bars.unseen],
-            "bars": {str(n): s.transmitter_id for n, s in positioner.bars.stands_at.items()},
+            "sites_unseen": [site.transmitter_id for site in positioner.bars.unseen_sites],
+            "bars": {str(n): s.transmitter_id for n, s in positioner.bars.known_sites.items()},
         }
 
 

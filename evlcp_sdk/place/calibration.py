@@ -1,7 +1,7 @@
-"""Focal length, principal point and distortion from bars at known places, seen from known places.
+"""Calibration of a camera: focal length, principal point and distortion from known bars and camera places.
 
 One least-squares problem over all views: the camera's parameters and each view's position and attitude, as
-far as these are not known. A parameter that the views do not determine keeps its configured value.
+far as these are unknown. A parameter that the views do not determine keeps its configured value.
 """
 
 import math
@@ -17,9 +17,15 @@ from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import check_columns, parse_csv_number, read_csv
-from evlcp_sdk.place.error_model import USUAL, ErrorModel
+from evlcp_sdk.place.error_model import DEFAULT_ERRORS, ErrorModel
 from evlcp_sdk.place.gnss import PLACE
-from evlcp_sdk.place.observations import BarView, between_of, camera_off, project_bars, shared_errors
+from evlcp_sdk.place.observations import (
+    BarView,
+    common_vibration,
+    compute_shared_errors,
+    perturb_camera,
+    project_bars,
+)
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
@@ -38,19 +44,19 @@ _RANGES = PLACE | {
     "roll_deg": (-360.0, 360.0),
     "t_us": (-1e18, 1e18),
 }
-"""What a pose's values may be; exact ones would outweigh all in double precision."""
+"""Ranges of a pose's values; exact ones would outweigh all in double precision."""
 
 
 @dataclass(frozen=True)
 class KnownPose:
-    """Where a camera was, and how it was turned if that is known: a row of `poses.csv`.
+    """A camera's place, and its attitude if known, at a time: a row of `poses.csv`.
 
     Attributes:
-        recording: Name of the recording's file; empty where there is only one.
+        recording: Name of the recording's file; empty if there is only one.
         t_us: When, camera clock, us.
-        position_sigma_m: Standard deviation of its place, WGS-84 and above the ellipsoid, in each axis, m.
-        attitude: With heading; None where it is not known.
-        attitude_sigma_deg: Standard deviation of a turn about each axis, degrees.
+        position_sigma_m: Standard deviation of its place (WGS-84, above the ellipsoid) in each axis, m.
+        attitude: With heading; None if it is unknown.
+        attitude_sigma_deg: Standard deviation of a rotation about each axis, degrees.
     """
 
     recording: str
@@ -79,9 +85,8 @@ def read_poses(path: Path | str) -> list[KnownPose]:
         raise ConfigError(f"{path}: expected one line of values or more")
     poses = []
     for line, row in rows:
-        # Angles come together.
-        angles = any(row.get(name) for name in _ANGLES)
-        needed = ("t_us", *PLACE, *(_ANGLES if angles else ()))
+        has_angles = any(row.get(name) for name in _ANGLES)
+        needed = ("t_us", *PLACE, *(_ANGLES if has_angles else ()))
         given = [name for name in _RANGES if name in needed or row.get(name)]
         value = {name: parse_csv_number(path, line, name, row.get(name), _RANGES[name]) for name in given}
         poses.append(
@@ -92,14 +97,14 @@ def read_poses(path: Path | str) -> list[KnownPose]:
                 value["longitude_deg"],
                 value["height_m"],
                 value.get("position_sigma_m", 0.01),
-                Attitude(value["pitch_deg"], value["roll_deg"], value["heading_deg"]) if angles else None,
+                Attitude(value["pitch_deg"], value["roll_deg"], value["heading_deg"]) if has_angles else None,
                 value.get("attitude_sigma_deg", 0.1),
             )
         )
     return poses
 
 
-_USUAL = {
+_USUAL_SIGMAS = {
     "focal_mm": 0.2,
     "centre_x_px": 0.02,
     "centre_y_px": 0.02,
@@ -108,27 +113,27 @@ _USUAL = {
     "p1": 1e-3,
     "p2": 1e-3,
 }
-"""Sigmas before anything is seen, of the focal length as a share of itself, of the principal point as a share
-of the columns: what lenses and their mounts have. What is not determined widens the sigmas of the rest."""
+"""Prior sigmas of lenses and their mounts: of the focal length as a share of itself, of the principal point
+as a share of the columns. What is not determined widens the sigmas of the rest."""
 
-_LEARNT = 0.5
-"""Share of that sigma below which the views, not it, determine a parameter."""
+_DETERMINED_SHARE = 0.5
+"""Share of the prior sigma below which the views, not the prior, determine a parameter."""
 
 _STEPS = 60
 _FREE_SIGMA_RAD = 0.5
-"""Sigma of an attitude that is not known, about its closed-form start."""
+"""Sigma of an unknown attitude about its closed-form start."""
 
-_MOST_USUAL = 4.0
-"""Sigmas of what is usual, 1 in 16 000, beyond which it is not the lens or its mount that is off."""
+_MOST_SIGMAS = 4.0
+"""Prior sigmas, 1 in 16 000, beyond which it is not the lens or its mount that is wrong."""
 
 MOST_MISFIT = 4.0
-"""Mean square of the misses, in sigmas, above which nothing is believed."""
+"""Mean square of the residuals, in sigmas, above which no result is given."""
 
-_OF_CAMERA, _OF_BAR = len(CAMERA_PARAMETERS), 8
-"""Unknowns of the camera, and of a bar: of its site three of place, three of turn, its length; how it looks
-bent."""
+_CAMERA_SIZE, _BAR_SIZE = len(CAMERA_PARAMETERS), 8
+"""Unknowns of the camera, and of a bar: of its site three of place, three of rotation, its length; its
+apparent curvature."""
 
-_LINE = 1e-6
+_LINE_SHARE = 1e-6
 """Share of the squares of a line's points about their middle that may lie across it."""
 
 
@@ -137,11 +142,11 @@ class CalibrationView:
     """The bars that a camera saw from a known place.
 
     Attributes:
-        bars: What was seen.
+        bars: The views of the bars.
         enu_m: The camera's place in the local axes, m, float64 (3,).
         position_sigma_m: Its standard deviation, m.
-        rotation: Camera axes as columns in ENU, float64 (3, 3); None where they are not known.
-        attitude_sigma_deg: Standard deviation of a turn about each axis, degrees.
+        rotation: Camera axes as columns in ENU, float64 (3, 3); None where they are unknown.
+        attitude_sigma_deg: Standard deviation of a rotation about each axis, degrees.
     """
 
     bars: tuple[BarView, ...]
@@ -152,63 +157,68 @@ class CalibrationView:
 
 
 @dataclass(frozen=True)
-class Calibrated:
-    """A camera as the views show it.
+class CalibrationResult:
+    """A camera as calibrated.
 
     Attributes:
-        camera: With what was determined; the rest as it was.
-        sigma: Standard deviation of each parameter that was determined, in its unit.
-        refused: Parameters that the views do not determine: how far the corners of the image would be
-            uncertain by each, px.
+        camera: With the determined parameters; the others are as configured.
+        sigma: Standard deviation of each determined parameter, in its unit.
+        undetermined_px: Parameters that the views do not determine: uncertainty of the image's corners by
+            each.
         views, points: Numbers of these.
-        misfit: Mean square of the misses in sigmas, over the degrees of freedom.
-        camera_sigma: How precisely the camera is known by this, with what was not determined; as a link has
-            it.
+        misfit: Mean square of the residuals in sigmas, over the degrees of freedom.
+        camera_sigma: Sigmas and correlations of all parameters, as a link has them.
     """
 
     camera: CameraModel
     sigma: Mapping[str, float]
-    refused: Mapping[str, float]
+    undetermined_px: Mapping[str, float]
     views: int
     points: int
     misfit: float
     camera_sigma: CameraSigma
 
 
-def calibrate(
-    views: Sequence[CalibrationView], camera: CameraModel, spec: ErrorModel = USUAL, *, limit_px: float = 2.0
-) -> Calibrated:
+def fit_camera(
+    views: Sequence[CalibrationView],
+    camera: CameraModel,
+    spec: ErrorModel = DEFAULT_ERRORS,
+    *,
+    limit_px: float = 2.0,
+) -> CalibrationResult:
     """Fit the camera to all views.
 
-    All parameters are fitted together, within what lenses own have. One is determined where the views say
-    more than that, and leave the image's corners uncertain by no more than a limit; the sigmas of these
-    contain what is not known of the others. Errors that a bar's points share are those of positions;
-    errors of a bar's site are the same in all views.
-
-    The fit starts at `camera`, of which is kept what is not determined: by one parameter the corners may be
-    uncertain by `limit_px`.
+    All parameters are fitted together, with the priors of usual lenses. One is determined if the views tell
+    more than its prior and leave the image's corners uncertain by no more than `limit_px`; others keep the
+    value of `camera`, at which the fit starts. The sigmas of the determined ones hold the uncertainty of the
+    others. Errors that a bar's points share are modelled as for positions; errors of a bar's site are the
+    same in all views.
 
     Raises:
         ConfigError: Not even the focal length is determined, or the views do not fit their places.
     """
-    seen = [one for view in views if (one := SeenView.of(view, camera, spec)) is not None]
+    seen = [one for view in views if (one := WhitenedView.of(view, camera, spec)) is not None]
     if not seen:
         raise ConfigError("no view shows a bar at a known site: nothing to calibrate from")
     start = replace(camera, centre_x_px=camera.centre_px[0], centre_y_px=camera.centre_px[1])
-    usual = _usual_sigma(start)
+    scale = {"focal_mm": start.focal_mm, "centre_x_px": start.width, "centre_y_px": start.width}
+    usual = {name: sigma * scale.get(name, 1.0) for name, sigma in _USUAL_SIGMAS.items()}
     # The focal length in mm.
-    own, lens = np.array([start.focal_mm / start.focal_px, *np.ones(6)]), np.diag([*usual.values()])
-    solved = solve_views(seen, start, lens / own[:, None])
-    found, misfit = solved.camera, solved.misfit
-    covariance = lens @ solved.covariance[:_OF_CAMERA, :_OF_CAMERA] @ lens.T
+    units, lens = np.array([start.focal_mm / start.focal_px, *np.ones(6)]), np.diag([*usual.values()])
+    solution = solve_views(seen, start, lens / units[:, None])
+    found, misfit = solution.camera, solution.misfit
+    covariance = lens @ solution.covariance[:_CAMERA_SIZE, :_CAMERA_SIZE] @ lens.T
     sigma = dict(zip(CAMERA_PARAMETERS, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    # How far the image's farthest corner moves by each.
     corners = np.array([[x, y] for x in (0.0, start.width) for y in (0.0, start.height)])
-    slopes = start.parameter_jacobian((corners - start.centre_px) / start.focal_px) / own
-    moved = np.linalg.norm(slopes, axis=1).max(0)
-    corner = {name: float(far) * sigma[name] for name, far in zip(CAMERA_PARAMETERS, moved, strict=True)}
-    sure = [n for n in CAMERA_PARAMETERS if corner[n] <= limit_px and sigma[n] <= _LEARNT * usual[n]]
-    if "focal_mm" not in sure:
+    slopes = start.parameter_jacobian((corners - start.centre_px) / start.focal_px) / units
+    farthest = np.linalg.norm(slopes, axis=1).max(0).tolist()
+    corner = {name: slope * sigma[name] for name, slope in zip(CAMERA_PARAMETERS, farthest, strict=True)}
+    determined = [
+        name
+        for name in CAMERA_PARAMETERS
+        if corner[name] <= limit_px and sigma[name] <= _DETERMINED_SHARE * usual[name]
+    ]
+    if "focal_mm" not in determined:
         raise ConfigError(
             "the views do not determine the focal length: the image's corners stay uncertain by"
             f" {corner['focal_mm']:.1f} px, {limit_px:g} px allowed"
@@ -216,31 +226,33 @@ def calibrate(
     if misfit > MOST_MISFIT:
         raise ConfigError(
             f"the views miss their places by {math.sqrt(misfit):.1f} sigmas (rms):"
-            " a site or pose is not as was said"
+            " a site or pose is not as stated"
         )
     for name in CAMERA_PARAMETERS[1:]:
-        value, said = getattr(found, name), getattr(start, name)
-        if abs(value - said) > _MOST_USUAL * usual[name]:
+        value, configured = getattr(found, name), getattr(start, name)
+        if abs(value - configured) > _MOST_SIGMAS * usual[name]:
             raise ConfigError(
-                f"{name} = {value:.4g} would fit the views, {said:.4g} is configured and {usual[name]:.2g} a"
-                " usual difference: angles of the poses, a place, or the configuration are not as was said"
+                f"{name} = {value:.4g} would fit the views, {configured:.4g} is configured and"
+                f" {usual[name]:.2g} a usual difference: angles of the poses, a place, or the configuration"
+                " are not as stated"
             )
-    kept = replace(start, **{name: getattr(found, name) for name in sure})
-    # What keeps its configured value is off by as much as the fit has it elsewhere, too.
-    off = np.array([getattr(kept, name) - getattr(found, name) for name in CAMERA_PARAMETERS])
-    return Calibrated(
-        replace(camera, **{name: getattr(found, name) for name in sure}),
-        {name: sigma[name] for name in sure},
-        {name: corner[name] for name in CAMERA_PARAMETERS if name not in sure},
+    changes = {name: getattr(found, name) for name in determined}
+    kept = replace(start, **changes)
+    # A parameter that keeps its configured value is wrong by its distance from the fit, too.
+    errors = np.array([getattr(kept, name) - getattr(found, name) for name in CAMERA_PARAMETERS])
+    return CalibrationResult(
+        replace(camera, **changes),
+        {name: sigma[name] for name in determined},
+        {name: corner[name] for name in CAMERA_PARAMETERS if name not in determined},
         len(seen),
         sum(len(v.points_px) for v in seen),
         misfit,
-        _camera_sigma(covariance + np.outer(off, off)),
+        _to_camera_sigma(covariance + np.outer(errors, errors)),
     )
 
 
-def _camera_sigma(covariance: Floats) -> CameraSigma:
-    """As a link has it; sigmas and correlations with the digits that they are written with."""
+def _to_camera_sigma(covariance: Floats) -> CameraSigma:
+    """Convert a covariance; sigmas and correlations get the digits that they are written with."""
     sigma = np.sqrt(np.diag(covariance))
     rows = np.round(covariance / sigma / sigma[:, None], 6)
     np.fill_diagonal(rows, 1.0)
@@ -248,16 +260,11 @@ def _camera_sigma(covariance: Floats) -> CameraSigma:
     return CameraSigma(**values, correlation=tuple(tuple(row) for row in rows.tolist()))
 
 
-def _usual_sigma(camera: CameraModel) -> dict[str, float]:
-    scale = {"focal_mm": camera.focal_mm, "centre_x_px": camera.width, "centre_y_px": camera.width}
-    return {name: sigma * scale.get(name, 1.0) for name, sigma in _USUAL.items()}
-
-
 @dataclass(frozen=True, eq=False)
-class SeenView:
-    """A view's points in one array, with what makes their errors white and of one sigma.
+class WhitenedView:
+    """A view's points in one array, with a matrix that makes their errors white and of sigma 1.
 
-    `bend_px` is by how much a bar that looks bent along itself, by a sigma, moves them, (n, 2).
+    `curvature_px` are the points' shifts by one sigma of their bar's apparent curvature, (n, 2).
     """
 
     enu_m: Floats
@@ -265,7 +272,7 @@ class SeenView:
     whiten: Floats
     bar: NDArray[np.int64]
     arm_m: Floats
-    bend_px: Floats
+    curvature_px: Floats
     survey: Mapping[int, tuple[float, float, float]]
     place_m: Floats
     place_sigma_m: float
@@ -273,66 +280,64 @@ class SeenView:
     turn_sigma_rad: float
 
     @classmethod
-    def of(cls, view: CalibrationView, camera: CameraModel, spec: ErrorModel) -> "SeenView | None":
-        """The points of the bars of which enough is seen; None where none is."""
-        seen, whiten, survey = [], [], {}
-        between = between_of(view.bars)
+    def of(cls, view: CalibrationView, camera: CameraModel, spec: ErrorModel) -> "WhitenedView | None":
+        """The points of the bars of which enough is seen; None if there is none."""
+        columns, whiten, survey = [], [], {}
+        vibration = common_vibration(view.bars)
         for bar in view.bars:
-            good = np.isfinite(bar.points_px).all(1) & (bar.sigma_px > 0)
-            if good.sum() < spec.min_points:
+            usable = np.isfinite(bar.points_px).all(1) & (bar.sigma_px > 0)
+            if usable.sum() < spec.min_points:
                 continue
-            arm, number = (bar.enu_m - bar.enu_m.mean(0))[good], np.full(good.sum(), bar.transmitter)
-            bend = spec.bend_sigma_px * _bend(bar.enu_m, good, bar.points_px)
-            seen.append((bar.enu_m[good], bar.points_px[good], number, arm, bend))
-            shared = shared_errors(bar, good, spec, between)
+            arm, number = (bar.enu_m - bar.enu_m.mean(0))[usable], np.full(usable.sum(), bar.transmitter)
+            curvature = spec.curvature_sigma_px * _curvature_slopes(bar.enu_m, usable, bar.points_px)
+            columns.append((bar.enu_m[usable], bar.points_px[usable], number, arm, curvature))
+            shared = compute_shared_errors(bar, usable, spec, vibration)
             place, turn, length = shared.survey.tolist()
             survey[bar.transmitter] = place, turn, length
-            # In any direction at most.
+            # The largest in any direction.
             shift = float(np.linalg.eigvalsh(shared.root)[-1])
-            covariance = np.diag((max(bar.across, 1.0) * bar.sigma_px[good]) ** 2) + shift**2
+            covariance = np.diag((max(bar.across, 1.0) * bar.sigma_px[usable]) ** 2) + shift**2
             whiten.append(np.linalg.inv(np.linalg.cholesky(covariance)))
-        if not seen:
+        if not columns:
             return None
-        enu, points, numbers, arms, bends = (np.concatenate(column) for column in zip(*seen, strict=True))
+        enu, points, numbers, arms, curves = (np.concatenate(parts) for parts in zip(*columns, strict=True))
         rotation = view.rotation
-        shaken_rad = between * spec.shaken_sigma_px / camera.focal_px
-        sigma = math.hypot(math.radians(view.attitude_sigma_deg), shaken_rad)
+        vibration_rad = vibration * spec.vibration_sigma_px / camera.focal_px
+        sigma = math.hypot(math.radians(view.attitude_sigma_deg), vibration_rad)
         if rotation is None:
-            # Brings sights best onto directions.
-            sights = np.column_stack([camera.undistort(points), np.ones(len(points))])
-            world = enu - view.enu_m
-            sights, world = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (sights, world))
-            rotation, sigma = Rotation.align_vectors(world, sights)[0].as_matrix(), _FREE_SIGMA_RAD
+            seen_at = np.column_stack([camera.undistort(points), np.ones(len(points))])
+            directions = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (enu - view.enu_m, seen_at)]
+            rotation, sigma = Rotation.align_vectors(*directions)[0].as_matrix(), _FREE_SIGMA_RAD
         camera_at = view.enu_m, view.position_sigma_m, rotation, sigma
-        return cls(enu, points, block_diag(*whiten), numbers, arms, bends, survey, *camera_at)
+        return cls(enu, points, block_diag(*whiten), numbers, arms, curves, survey, *camera_at)
 
 
-def _bend(enu_m: Floats, seen: NDArray[np.bool_], points_px: Floats) -> Floats:
-    """How the points that are seen of a line move as it bends along itself, in the image, float64 (n, 2).
+def _curvature_slopes(enu_m: Floats, seen: NDArray[np.bool_], points_px: Floats) -> Floats:
+    """Shifts of the seen points of a line by its curvature along itself, in the image, float64 (n, 2).
 
-    By what the square of a point's place has besides a constant and its place; the sum of squares over the
-    whole bar is 1. Nothing where clusters are not in a line.
+    The mode is quadratic in a point's place, without constant and linear part; the sum of squares over the
+    whole bar is 1. 0 for clusters that are not in line.
     """
     arm = enu_m - enu_m.mean(0)
     along = arm @ np.linalg.svd(arm)[2][0]
-    if (arm**2).sum() - along @ along > _LINE * (arm**2).sum():
+    if (arm**2).sum() - along @ along > _LINE_SHARE * (arm**2).sum():
         return np.zeros((int(seen.sum()), 2))
     modes, _ = np.linalg.qr(np.stack([np.ones_like(along), along, along**2], 1))
-    way = points_px[seen][-1] - points_px[seen][0]
-    return np.asarray(modes[seen, 2][:, None] * (way / max(float(np.linalg.norm(way)), 1e-9)))
+    axis = points_px[seen][-1] - points_px[seen][0]
+    return np.asarray(modes[seen, 2][:, None] * (axis / max(float(np.linalg.norm(axis)), 1e-9)))
 
 
 @dataclass(frozen=True, eq=False)
-class SolvedViews:
-    """All views solved together.
+class ViewSolution:
+    """The solution of all views together.
 
     Attributes:
-        camera: With its parameters as found.
+        camera: With fitted parameters.
         x: All unknowns, in their sigmas: the camera's parameters, six of each view, eight of each bar, and
             six that all views share, float64 (n,).
         covariance: Of these, float64 (n, n).
-        bars: Where a bar's eight are: its site's place, turn and length, and how it looks bent.
-        misfit: Mean square of the misses in sigmas, over the degrees of freedom.
+        bars: Slices of each bar's eight: its site's place, rotation and length, and its apparent curvature.
+        misfit: Mean square of the residuals in sigmas, over the degrees of freedom.
     """
 
     camera: CameraModel
@@ -343,17 +348,17 @@ class SolvedViews:
 
 
 @dataclass(frozen=True)
-class _Model:
-    """What the unknowns of `solve_views` make of each view.
+class _ViewModel:
+    """The model of `solve_views`: each view's residuals by the unknowns.
 
     Attributes:
-        root: A root of the covariance of the camera's parameters as they are known beforehand, the focal
-            length in px, float64 (7, 7).
-        common: Sigmas of an error of place, m, and of a turn, radians, that all views share.
-        surveys: Sigmas of each bar's site that has any: of place, turn and length.
+        root: A root of the prior covariance of the camera's parameters, the focal length in px, float64 (7,
+            7).
+        common: Sigmas of an error of place, m, and of a rotation, radians, that all views share.
+        surveys: Sigmas of each bar's site that has any: of place, rotation and length.
     """
 
-    views: Sequence[SeenView]
+    views: Sequence[WhitenedView]
     camera: CameraModel
     root: Floats
     common: tuple[float, float]
@@ -361,82 +366,89 @@ class _Model:
 
     @property
     def bars(self) -> dict[int, int]:
-        """Where a bar's unknowns begin: errors of its site, in sigmas, behind the views."""
-        begin = _OF_CAMERA + 6 * len(self.views)
-        return {number: begin + _OF_BAR * i for i, number in enumerate(sorted(self.surveys))}
+        """First column of each bar's unknowns, behind those of the views."""
+        begin = _CAMERA_SIZE + 6 * len(self.views)
+        return {number: begin + _BAR_SIZE * i for i, number in enumerate(sorted(self.surveys))}
 
     def camera_of(self, x: Floats) -> CameraModel:
         """The camera by the unknowns."""
-        return camera_off(self.camera, self.root @ x[:_OF_CAMERA])
+        return perturb_camera(self.camera, self.root @ x[:_CAMERA_SIZE])
 
-    def parts(self, x: Floats) -> tuple[Floats, Floats]:
-        """Misses in sigmas, float64 (m,), and their slopes, float64 (m, n)."""
-        misses, rows = [x], [np.eye(len(x))]
-        now = self.camera_of(x)
+    def linearize(self, x: Floats) -> tuple[Floats, Floats]:
+        """Residuals in sigmas, float64 (m,), and their slopes, float64 (m, n)."""
+        residuals, rows = [x], [np.eye(len(x))]
+        camera = self.camera_of(x)
         for i, view in enumerate(self.views):
-            place, block = self._seen(x, view, _OF_CAMERA + 6 * i, now)
+            points, block = self._project_view(x, view, _CAMERA_SIZE + 6 * i, camera)
             for axis in (0, 1):
-                # A step that turns a point behind the camera is not to be taken.
-                off = np.nan_to_num(place[:, axis] - view.points_px[:, axis], nan=1e6)
-                misses.append(view.whiten @ off)
+                # A step that puts a point behind the camera must not be taken.
+                error_px = np.nan_to_num(points[:, axis] - view.points_px[:, axis], nan=1e6)
+                residuals.append(view.whiten @ error_px)
                 rows.append(view.whiten @ np.nan_to_num(block[:, axis]))
-        return np.concatenate(misses), np.concatenate(rows)
+        return np.concatenate(residuals), np.concatenate(rows)
 
-    def _seen(self, x: Floats, view: SeenView, at: int, now: CameraModel) -> tuple[Floats, Floats]:
-        """Where a view has its points, px, float64 (p, 2), and the slopes of these, float64 (p, 2, n)."""
-        own, common = np.repeat([view.place_sigma_m, view.turn_sigma_rad], 3), np.repeat(self.common, 3)
-        off = own * x[at : at + 6] + common * x[-6:]
-        rotation = Rotation.from_rotvec(off[3:]).as_matrix() @ view.rotation
-        position = view.place_m + off[:3]
-        stands, moves = view.enu_m.copy(), {}
+    def _project_view(
+        self, x: Floats, view: WhitenedView, first: int, camera: CameraModel
+    ) -> tuple[Floats, Floats]:
+        """A view's expected points, px, float64 (p, 2), and their slopes, float64 (p, 2, n)."""
+        sigmas, common = np.repeat([view.place_sigma_m, view.turn_sigma_rad], 3), np.repeat(self.common, 3)
+        errors = sigmas * x[first : first + 6] + common * x[-6:]
+        rotation = Rotation.from_rotvec(errors[3:]).as_matrix() @ view.rotation
+        position = view.place_m + errors[:3]
+        places, site_slopes = view.enu_m.copy(), {}
         for number, column in self.bars.items():
-            mine = view.bar == number
-            if mine.any():
-                moves[column] = mine, _site_slope(view.arm_m[mine], self.surveys[number])
-                stands[mine] += moves[column][1] @ x[column : column + 7]
-        place, slope = project_bars(stands, position, rotation, now)
-        for column, (mine, _) in moves.items():
-            place[mine] += x[column + 7] * view.bend_px[mine]
-        seen = (stands - position) @ rotation
-        block = np.zeros((len(place), 2, len(x)))
-        block[:, :, :_OF_CAMERA] = now.parameter_jacobian(seen[:, :2] / seen[:, 2:]) @ self.root
-        slope[:, :, 3:] = slope[:, :, 3:] @ _turn_slope(off[3:])
-        block[:, :, at : at + 6], block[:, :, -6:] = slope * own, slope * common
-        for column, (mine, by_site) in moves.items():
-            block[mine, :, column : column + 7] = -slope[mine][:, :, :3] @ by_site
-            block[mine, :, column + 7] = view.bend_px[mine]
-        return place, block
+            rows = view.bar == number
+            if rows.any():
+                site_slopes[column] = rows, _site_slope(view.arm_m[rows], self.surveys[number])
+                places[rows] += site_slopes[column][1] @ x[column : column + 7]
+        points, slope = project_bars(places, position, rotation, camera)
+        for column, (rows, _) in site_slopes.items():
+            points[rows] += x[column + 7] * view.curvature_px[rows]
+        in_camera = (places - position) @ rotation
+        block = np.zeros((len(points), 2, len(x)))
+        directions = in_camera[:, :2] / in_camera[:, 2:]
+        block[:, :, :_CAMERA_SIZE] = camera.parameter_jacobian(directions) @ self.root
+        slope[:, :, 3:] = slope[:, :, 3:] @ _turn_slope(errors[3:])
+        block[:, :, first : first + 6], block[:, :, -6:] = slope * sigmas, slope * common
+        for column, (rows, by_site) in site_slopes.items():
+            block[rows, :, column : column + 7] = -slope[rows][:, :, :3] @ by_site
+            block[rows, :, column + 7] = view.curvature_px[rows]
+        return points, block
 
 
 def solve_views(
-    views: Sequence[SeenView], camera: CameraModel, root: Floats, common: tuple[float, float] = (0.0, 0.0)
-) -> SolvedViews:
-    """Least squares over everything; `camera` is where the fit starts, the others as in `_Model`."""
+    views: Sequence[WhitenedView], camera: CameraModel, root: Floats, common: tuple[float, float] = (0.0, 0.0)
+) -> ViewSolution:
+    """Solve the least squares of all views; the fit starts at `camera`, other arguments are as of
+    `_ViewModel`.
+    """
     surveys: dict[int, tuple[float, float, float]] = {}
     for view in views:
-        surveys |= {n: sigma for n, sigma in view.survey.items() if any(sigma) or view.bend_px.any()}
-    model = _Model(views, camera, root, common, surveys)
+        surveys |= {n: sigma for n, sigma in view.survey.items() if any(sigma) or view.curvature_px.any()}
+    model = _ViewModel(views, camera, root, common, surveys)
 
-    def misses_of(x: Floats) -> Floats:
-        return model.parts(x)[0]
+    def residuals_of(x: Floats) -> Floats:
+        return model.linearize(x)[0]
 
     def slopes_of(x: Floats) -> Floats:
-        return model.parts(x)[1]
+        return model.linearize(x)[1]
 
-    start = np.zeros(_OF_CAMERA + 6 * len(views) + _OF_BAR * len(surveys) + 6)
-    fit = least_squares(misses_of, start, slopes_of, x_scale="jac", max_nfev=_STEPS)
-    misses, rows = model.parts(fit.x)
+    start = np.zeros(_CAMERA_SIZE + 6 * len(views) + _BAR_SIZE * len(surveys) + 6)
+    fit = least_squares(residuals_of, start, slopes_of, x_scale="jac", max_nfev=_STEPS)
+    residuals, rows = model.linearize(fit.x)
     scale = 1 / np.sqrt((rows**2).sum(0))
-    half = np.linalg.inv(np.linalg.qr(rows * scale, mode="r"))
-    covariance = (half @ half.T) * scale * scale[:, None]
+    root = np.linalg.inv(np.linalg.qr(rows * scale, mode="r"))
+    covariance = (root @ root.T) * scale * scale[:, None]
     points = 2 * sum(len(v.points_px) for v in views)
-    freedom = max(points - _OF_CAMERA - 3 * len(views), 1)
-    where = {number: slice(column, column + _OF_BAR) for number, column in model.bars.items()}
-    return SolvedViews(model.camera_of(fit.x), fit.x, covariance, where, float(misses @ misses) / freedom)
+    freedom = max(points - _CAMERA_SIZE - 3 * len(views), 1)
+    slices = {number: slice(column, column + _BAR_SIZE) for number, column in model.bars.items()}
+    return ViewSolution(
+        model.camera_of(fit.x), fit.x, covariance, slices, float(residuals @ residuals) / freedom
+    )
 
 
 def _site_slope(arm_m: Floats, survey: tuple[float, float, float]) -> Floats:
-    """How points of a bar move by one sigma of its site's place, turn and length: m, float64 (n, 3, 7)."""
+    """Shifts of a bar's points, m, by sigmas of its site's place, rotation and length, float64 (n, 3, 7)."""
     place, turn, length = survey
     moves = np.zeros((len(arm_m), 3, 7))
     moves[:, :, :3] = place * np.eye(3)
@@ -446,7 +458,7 @@ def _site_slope(arm_m: Floats, survey: tuple[float, float, float]) -> Floats:
 
 
 def _turn_slope(turn: Floats) -> Floats:
-    """Small turn of the whole by the parts of a rotation vector (the left Jacobian of the rotations)."""
+    """Small rotation by the components of a rotation vector (the left Jacobian of the rotation group)."""
     angle = float(np.linalg.norm(turn))
     cross = np.cross(np.eye(3), turn)
     if angle < 1e-6:

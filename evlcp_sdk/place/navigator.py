@@ -1,4 +1,4 @@
-"""Packets to the camera's trajectory: fixes as they are known, filtered at once, smoothed a window later."""
+"""Packets to the camera's trajectory: fixes as computed, filtered at once, smoothed a window later."""
 
 import math
 from collections import deque
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.gnss import GnssLog, attitude_of, gnss_fix
+from evlcp_sdk.place.gnss import GnssLog, add_heading, to_camera_fix
 from evlcp_sdk.place.positioner import BarKind, Positioner
 from evlcp_sdk.place.trajectory import (
     GNSS,
     IMU,
     TrajectoryPoint,
-    heading_at,
+    predict_heading,
     smooth_trajectory,
-    trajectory_step,
+    step_trajectory,
 )
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
@@ -35,12 +35,12 @@ _DETERMINED_SHARE = 0.9
 
 @dataclass(frozen=True)
 class EstimatedBias:
-    """One standing error as a drive shows it.
+    """One standing error as estimated by a drive.
 
     Attributes:
         part: `camera`, `attitude`, `imu`, `bar N`.
-        what: What of it, with its unit: `focal_mm`, `pitch_deg`, `time_us`, `east_m` ...
-        correction: What is to be added to what was stated.
+        what: Which error, with its unit: `focal_mm`, `pitch_deg`, `time_us`, `east_m` ...
+        correction: To be added to the stated value.
         sigma: Of it.
         stated_sigma: Before the drive.
     """
@@ -53,7 +53,7 @@ class EstimatedBias:
 
     @property
     def determined(self) -> bool:
-        """Whether the drive says anything of it; else it keeps the sigma that was stated."""
+        """Whether the drive determines it; else it keeps the stated sigma."""
         return self.sigma < _DETERMINED_SHARE * self.stated_sigma
 
 
@@ -65,12 +65,12 @@ def estimate_biases(
     sites: Mapping[int, BarSite],
     spec: ErrorModel,
 ) -> list[EstimatedBias]:
-    """Standing states in their units; an error that was stated as none is left out.
+    """Convert standing states to their units; an error without a stated sigma is left out.
 
-    The states are of each part, means in its sigmas, (k,), and covariance, (k, k), as
-    `TrajectoryPoint.standing` has them; the others are as stated.
+    `states` are of each part, means in its sigmas, (k,), and covariance, (k, k), as in
+    `TrajectoryPoint.standing`; the other arguments are as stated.
     """
-    found: list[EstimatedBias] = []
+    biases: list[EstimatedBias] = []
     for part, (mean, covariance) in states.items():
         if part == "camera":
             root = camera_sigma.covariance_root(camera)
@@ -78,14 +78,14 @@ def estimate_biases(
             names: tuple[str, ...] = CAMERA_PARAMETERS
         elif part == "attitude" and attitude is not None:
             gravity, heading = attitude.gravity_sigma_deg, attitude.heading_sigma_deg
-            # Angles that are measured too large are to be made smaller; one that is early, later.
+            # A correction has the opposite sign of an error.
             root = np.diag([-gravity, -gravity, -heading, attitude.time_sigma_us])
             names = ("pitch_deg", "roll_deg", "heading_deg", "time_us")
         elif part == IMU:
-            root = np.diag([-spec.rate_sigma_deg_s, *(len(mean) - 1) * [-spec.push_sigma_m_s2]])
+            root = np.diag([-spec.rate_sigma_deg_s, *(len(mean) - 1) * [-spec.accelerometer_sigma_m_s2]])
             names = ("rate_deg_s", "push_right_m_s2", "push_forward_m_s2", "push_up_m_s2")[: len(mean)]
         elif part.startswith("bar ") and len(mean) > 1 and (site := sites.get(int(part[4:]))) is not None:
-            # After its length come its place and its turn.
+            # After its length come its place and its rotation.
             mean, covariance = mean[1:4], covariance[1:4, 1:4]
             root = site.survey_sigmas[0] * np.eye(3)
             names = ("east_m", "north_m", "up_m")
@@ -96,14 +96,14 @@ def estimate_biases(
         for i, name in enumerate(names):
             if stated[i] > 0:
                 sigma = math.sqrt(max(float(spread[i, i]), 0.0))
-                found.append(EstimatedBias(part, name, float(values[i]), sigma, float(stated[i])))
-    return found
+                biases.append(EstimatedBias(part, name, float(values[i]), sigma, float(stated[i])))
+    return biases
 
 
 def focal_share(
     state: tuple[Floats, Floats] | None, camera: CameraModel, camera_sigma: CameraSigma
 ) -> tuple[float, float]:
-    """By what share the focal length is longer than stated, and its sigma; NaN if it was stated exactly."""
+    """Relative error of the stated focal length, and its sigma; NaN if it was stated exactly."""
     if state is None or not camera_sigma.focal_mm > 0:
         return math.nan, math.nan
     row = camera_sigma.covariance_root(camera)[0] / camera.focal_px
@@ -111,34 +111,34 @@ def focal_share(
 
 
 _BLOCK = 1024
-"""Points smoothed at a time; those behind them, as many again, are over half a minute: far more than an
-acceleration of 1 m/s2 lasts against fixes of centimetres."""
+"""Points smoothed at a time; those behind them, as many again, are over half a minute: far longer than an
+acceleration of 1 m/s2 matters against fixes of centimetres."""
 
 
-_MOST_PARTS = 256
-"""Parts whose standing errors are remembered; the one not seen for longest makes way."""
+_MOST_STANDING = 256
+"""Parts whose standing errors are remembered; then the one not seen for longest is dropped."""
 
-_STANDS_US = 10e6
-"""Time in which a track stands on what it took last of bars, and of satellites."""
+_SUPPORT_US = 10e6
+"""Time for which fixes of a source support the track."""
 
 
 @dataclass(frozen=True)
 class PositionPlan:
-    """What positions are computed from, beside the image and the camera's attitude.
+    """What positions are computed from, besides the image and the camera's attitude.
 
     Attributes:
         sites: Where the bars stand.
-        gnss: Fixes of satellites, which enter the track; None for none.
+        gnss: GNSS fixes, which enter the track; None for none.
     """
 
     sites: tuple[BarSite, ...]
     gnss: GnssLog | None = None
 
     def check_links(self, names: Sequence[str]) -> None:
-        """Check that the sites' `link` are among several links' names; a single link has no name to check.
+        """Check that each site's `link` is among the names of several links; a single link has none to check.
 
         Raises:
-            ConfigError: One is not: no bar would ever stand there.
+            ConfigError: One is not, so that no bar would ever stand there.
         """
         for site in self.sites if len(names) > 1 else ():
             if site.link is not None and site.link not in names:
@@ -157,11 +157,11 @@ class Place:
         enu_m: The place, WGS-84 and above the ellipsoid, in the local axes, m, float64 (3,).
         covariance_m2: Of `enu_m`, float64 (3, 3).
         speed_m_s: Over ground.
-        course_deg: Where it moves to, clockwise from north.
-        left_out: The fix at this time was beyond the gate, or failed its test, and does not count.
-        starts: A trajectory starts here; nothing is known of its speed, unless it is smoothed.
-        focal_share: By what share the focal length is longer than stated, as the track has it; NaN
-            where it was stated exactly.
+        course_deg: Direction of movement, clockwise from north.
+        left_out: The fix at this time was rejected by the gate or its test.
+        starts: A trajectory starts here; its speed is unknown, unless it is smoothed.
+        focal_share: Relative error of the stated focal length, as the track estimates it; NaN where it was
+            stated exactly.
         focal_share_sigma: Of it.
     """
 
@@ -181,12 +181,12 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """A fix with its places that no later fix changes.
+    """A fix with its places, which no later fix changes.
 
     Attributes:
-        fix: As it was measured.
+        fix: As measured.
         filtered: By the fixes up to it.
-        smoothed: By those after it, too.
+        smoothed: By later ones, too.
     """
 
     fix: Fix
@@ -196,12 +196,12 @@ class Settled:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """What a packet adds: a fix, and what it settles.
+    """The result of a packet: a fix, and earlier ones that it settles.
 
     Attributes:
         fix: Given or refused.
         filtered: The place at its time; None for a refused fix.
-        settled: Earlier fixes that are settled now, in order of time; mostly none.
+        settled: In order of time; mostly none.
     """
 
     fix: Fix
@@ -213,10 +213,9 @@ class Navigator:
     """A recording's positions, in constant memory.
 
     Args:
-        links: The configuration that the receiver ran with; of several, those that show where bars are, by
-            name.
-        plan: Where the bars stand.
-        attitude: What is known of the camera's attitude, the same always or over time; None for nothing.
+        links: The receiver's configuration; of several, those that locate bars, by name.
+        plan: Where the bars stand, and GNSS.
+        attitude: The camera's attitude, constant or over time; None if it is unknown.
     """
 
     def __init__(
@@ -241,20 +240,20 @@ class Navigator:
         self._attitude_at = attitude_source(attitude)
         self._gnss, self._gnss_next = plan.gnss, 0
         self._span: tuple[float, float] | None = None
-        self._taken: dict[str, float] = {}
+        self._last_used_us: dict[str, float] = {}
         self._link = link
         self._attitude: Attitude | None = None
         self._standing: dict[str, tuple[Floats, Floats]] = {}
         self._counts = dict.fromkeys(("gnss", "gnss_left_out", "gnss_without_heading", "attitude_missing"), 0)
-        self._contradictions_m: deque[Floats] = deque(maxlen=_BLOCK)
+        self._gnss_offsets_m: deque[Floats] = deque(maxlen=_BLOCK)
         self._state: TrajectoryPoint | None = None
         self._window: list[tuple[Fix, TrajectoryPoint, Place]] = []
 
     @property
     def counts(self) -> dict[str, int]:
-        """Fixes of satellites: taken, left out of the track, without a heading that the antenna needs, and
-        outside of the recording's time, as far as it has come; fixes of bars, given or not, at whose times
-        an attitude's file has none, and its lines if all are outside of that time.
+        """GNSS fixes: used, left out of the track, without the heading that the antenna needs, and outside of
+        the recording's time so far; fixes of bars, given or not, without an attitude in the attitude file,
+        and that file's lines if all are outside of that time.
         """
         used = self._counts["gnss"] + self._counts["gnss_without_heading"]
         given = 0 if self._gnss is None else len(self._gnss.t_us)
@@ -266,45 +265,44 @@ class Navigator:
         return self._counts | {"gnss_outside": given - used, "attitude_outside": lines}
 
     @property
-    def apart_m(self) -> Floats | None:
-        """By how much GNSS is to the east, north and up of bars where they contradict one another.
+    def gnss_offset_m(self) -> Floats | None:
+        """Offset of GNSS from bars to the east, north and up where they contradict one another.
 
         The median of the last thousand times, float64 (3,); None for none.
         """
-        return np.median(self._contradictions_m, 0) if self._contradictions_m else None
+        return np.median(self._gnss_offsets_m, 0) if self._gnss_offsets_m else None
 
-    def note_span(self, first_us: float, last_us: float) -> None:
-        """Take note that the recording has events from one time to another: fixes of satellites count in it.
+    def extend_span(self, first_us: float, last_us: float) -> None:
+        """Extend the time span of the recording's events, in which GNSS fixes count.
 
         Without it, those from the first fix of bars to the last one count.
         """
         self._span = (first_us if self._span is None else self._span[0], last_us)
 
     def feed(self, packets: Iterable[Packet]) -> list[Placed]:
-        """Take the receiver's next packets; return the fixes that no later packet can change."""
-        return self._in_time(self.positioner.feed(packets))
+        """Process the receiver's next packets; return the fixes that no later packet can change."""
+        return self._merge_gnss(self.positioner.feed(packets))
 
     def close(self) -> tuple[list[Placed], tuple[Settled, ...]]:
-        """End the stream; return the rest of the fixes, and what was not settled before."""
-        placed = self._in_time(self.positioner.close())
+        """End the stream; return the rest of the fixes, and those not settled before."""
+        placed = self._merge_gnss(self.positioner.close())
         if self._span is not None:
-            placed += self._satellites(self._span[1])
-        return placed, self._settle(len(self._window))
+            placed += self._filter_gnss(self._span[1])
+        return placed, self._smooth_oldest(len(self._window))
 
-    def _in_time(self, fixes: Iterable[Fix]) -> list[Placed]:
-        """Fixes of bars, and those of satellites before each."""
+    def _merge_gnss(self, fixes: Iterable[Fix]) -> list[Placed]:
+        """Filter fixes of bars, each after the GNSS fixes before it."""
         placed = []
         for fix in fixes:
             if self._span is None:
                 self._span = (fix.t_us, fix.t_us)
-            placed += self._satellites(fix.t_us)
-            self._counts["attitude_missing"] += (
-                self._log is not None and self._log.interpolate(fix.t_us) is None
-            )
+            placed += self._filter_gnss(fix.t_us)
+            if self._log is not None and self._log.interpolate(fix.t_us) is None:
+                self._counts["attitude_missing"] += 1
             placed.append(self._filter(fix))
         return placed
 
-    def _satellites(self, until_us: float) -> list[Placed]:
+    def _filter_gnss(self, until_us: float) -> list[Placed]:
         log, placed = self._gnss, []
         if log is None or self._span is None:
             return []
@@ -314,17 +312,17 @@ class Navigator:
             if self.positioner.axes is None:
                 self.positioner.axes = LocalAxes(*log.place[row].tolist())
             t_us = log.t_us[row]
-            heading = None if self._state is None else heading_at(self._state, t_us, self._imu)
-            attitude = attitude_of(self._attitude_at(t_us), heading)
-            fix = gnss_fix(log, row, self.positioner.axes, attitude, self._spec)
+            heading = None if self._state is None else predict_heading(self._state, t_us, self._imu)
+            attitude = add_heading(self._attitude_at(t_us), heading)
+            fix = to_camera_fix(log, row, self.positioner.axes, attitude, self._spec)
             self._counts["gnss" if fix is not None else "gnss_without_heading"] += 1
             if fix is not None:
                 placed.append(self._filter(fix))
         return placed
 
-    def estimated_biases(self) -> list[EstimatedBias]:
-        """What the drive says so far of standing errors: of the camera, the attitude, the IMU, the sites."""
-        link, sites = self._link, self.positioner.bars.stands_at
+    def estimate_biases(self) -> list[EstimatedBias]:
+        """Estimates so far of standing errors: of the camera, the attitude, the IMU, the sites."""
+        link, sites = self._link, self.positioner.bars.known_sites
         camera, sigma = link.camera, link.camera_sigma
         return estimate_biases(self._standing, camera, sigma, self._attitude, sites, self._spec)
 
@@ -333,38 +331,38 @@ class Navigator:
         axes = self.positioner.axes
         if axes is None:
             return {}
-        sites = self.positioner.bars.stands_at.items()
+        sites = self.positioner.bars.known_sites.items()
         return {n: axes.to_enu(s.latitude_deg, s.longitude_deg, s.height_m) for n, s in sites}
 
     def _filter(self, fix: Fix) -> Placed:
         if fix.refusal:
             return Placed(fix, None)
-        point = self._state = trajectory_step(self._state, fix, self._spec, self._imu)
+        point = self._state = step_trajectory(self._state, fix, self._spec, self._imu)
         if point.starts:
-            self._taken = {}
-        if point.misses:
-            # What contradicts it: bars, GNSS, on which the track stood when it was left out.
+            self._last_used_us = {}
+        if point.rejected:
+            # Other sources that supported the track when it was left out contradict it.
             self._counts["gnss_left_out"] += fix.source == GNSS
-            taken = self._taken.items()
-            others = tuple(n for n, t in taken if n != fix.source and fix.t_us - t <= _STANDS_US)
+            used = self._last_used_us.items()
+            others = tuple(n for n, t in used if n != fix.source and fix.t_us - t <= _SUPPORT_US)
             if others:
-                off = fix.enu_m - point.mean[:3]
-                self._contradictions_m.append(off if fix.source == GNSS else -off)
+                offset = fix.enu_m - point.mean[:3]
+                self._gnss_offsets_m.append(offset if fix.source == GNSS else -offset)
             fix = replace(fix, contradicted=others)
         else:
-            self._taken[fix.source] = fix.t_us
+            self._last_used_us[fix.source] = fix.t_us
         self._attitude = self._attitude_at(fix.t_us) or self._attitude
         for cause in point.causes:
-            # The last of many bars are kept.
+            # Moves it to the end.
             self._standing.pop(cause.name, None)
             self._standing[cause.name] = point.standing(cause.name)  # type: ignore[assignment]
-        while len(self._standing) > _MOST_PARTS:
+        while len(self._standing) > _MOST_STANDING:
             del self._standing[next(iter(self._standing))]
         filtered = self._to_place(point)
         self._window.append((fix, point, filtered))
-        return Placed(fix, filtered, self._settle(_BLOCK) if len(self._window) == 2 * _BLOCK else ())
+        return Placed(fix, filtered, self._smooth_oldest(_BLOCK) if len(self._window) == 2 * _BLOCK else ())
 
-    def _settle(self, count: int) -> tuple[Settled, ...]:
+    def _smooth_oldest(self, count: int) -> tuple[Settled, ...]:
         """Smooth the window, and drop its first points from it."""
         smoothed = smooth_trajectory([point for _, point, _ in self._window], self._spec)
         settled = tuple(
@@ -389,7 +387,7 @@ class Navigator:
             point.covariance_m2,
             math.hypot(east, north),
             math.degrees(math.atan2(east, north)) % 360,
-            point.misses > 0,
+            point.rejected > 0,
             point.starts,
             *focal_share(point.standing("camera"), link.camera, link.camera_sigma),
         )

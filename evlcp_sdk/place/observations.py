@@ -1,6 +1,4 @@
-"""What a camera sees of bars at known places, with everything that is known of its errors, in arrays;
-or why that gives no position.
-"""
+"""Observations of bars at known places and their errors, as arrays; or why they give no position."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +16,7 @@ from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 Floats = NDArray[np.float64]
 
 CONTRADICTIONS = frozenset({"site-contradicted", "not-determined", "misfit"})
-"""Kinds of refusal where what is seen and what is said do not fit together; of others too little is known."""
+"""Kinds of rejection where observations contradict what is stated; for the others, too little is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +26,7 @@ class Candidate:
     Attributes:
         covariance_m2: Of the position, if it is the right one, float64 (3, 3); NaN where an ellipse does not
             describe its error.
-        likelihood: How likely the image is from here, against the likeliest.
+        likelihood: Of the image from here, relative to the likeliest candidate.
     """
 
     enu_m: NDArray[np.float64]
@@ -42,10 +40,10 @@ class Rejection:
     """Why there is no position.
 
     Attributes:
-        kind: One of those of `docs/position.md`.
+        kind: One of those in `docs/position.md`.
         detail: The same in words, with the figures of this case.
-        candidates: Of `two-solutions`, the poses that fit, the likeliest first.
-        suspects: Of `misfit`, the parts of which one, if it were left out, would explain it.
+        candidates: For `two-solutions`, the poses that fit, the likeliest first.
+        suspects: For `misfit`, the parts any one of which, left out, would explain it.
     """
 
     kind: str
@@ -54,15 +52,14 @@ class Rejection:
     suspects: tuple[str, ...] = ()
 
 
-_INLINE = 0.02
-"""Bars whose centres lie within this share of their extent from a line stand in line: beyond, the shape of a
-triangle of 10 m at 50 m is seen to better than a pixel of 7000 px."""
+_COLLINEAR_SHARE = 0.02
+"""Bars whose centres lie within this share of their extent from a line are in line: beyond, the shape of a
+triangle of 10 m at 50 m is seen to better than a pixel, with a focal length of 7000 px."""
 
-EXACT_RAD = 1e-7
+_LEAST_ANGLE_RAD = 1e-7
 """Least sigma of an angle, so that exact knowledge stays solvable: 5 um at 50 m."""
 
-_BOTH = np.eye(2)
-"""Columns and rows alike."""
+_IDENTITY = np.eye(2)
 
 _LEVI_CIVITA = np.zeros((3, 9))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -77,17 +74,16 @@ class BarView:
         transmitter: Number that the receiver gave it.
         enu_m: Centres of its clusters in the local axes, m, float64 (K, 3).
         points_px: Where they are seen, px, float64 (K, 2); NaN where unseen.
-        sigma_px: Their standard deviations, px, float64 (K,).
-        survey: Sigmas of the bar's place, m, of a turn of it about each axis, radians, and of its length, as
+        sigma_px: Their standard deviations along the bar, px, float64 (K,).
+        survey: Sigmas of the bar's place, m, of its rotation about each axis, radians, and of its length, as
             a share; 0: exact.
-        pixel_px: The part of `sigma_px` that stands until the image has moved; None: `position.
-            pixel_sigma_px`.
-        shift_px: What all points share across the bar besides `ErrorModel.shared_sigma_px`, px.
-        between: How far the image may have moved otherwise than its frames show, in `position.
-            shaken_sigma_px`.
-        early_px: What all points share in any direction besides, as a moving image is seen early or late, px.
-        across: Errors of points across the bar, in those along it, which `sigma_px` are.
-        stretch: By how much it looks too long, or short, as its image is bent: a share (sigma).
+        pixel_px: The part of `sigma_px` that persists until the image has moved; None for
+            `ErrorModel.pixel_sigma_px`.
+        shift_px: Error that all points share across the bar besides `ErrorModel.shared_sigma_px`, px.
+        vibration: Unseen movement of the image between frames, in `ErrorModel.vibration_sigma_px`.
+        timing_px: Error that all points share in any direction by the timing of a moving image, px.
+        across: Ratio of the points' errors across the bar to those along it.
+        stretch: Sigma of its apparent length, as a share, where its image is curved.
     """
 
     transmitter: int
@@ -97,8 +93,8 @@ class BarView:
     survey: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pixel_px: float | None = None
     shift_px: float = 0.0
-    between: float = 1.0
-    early_px: float = 0.0
+    vibration: float = 1.0
+    timing_px: float = 0.0
     across: float = 1.0
     stretch: float = 0.0
 
@@ -106,100 +102,100 @@ class BarView:
 def project_bars(
     enu_m: Floats, position_m: Floats, rotation: Floats, camera: CameraModel
 ) -> tuple[Floats, Floats]:
-    """Image points of a camera's surroundings, and their derivatives.
+    """Image points of places, and their derivatives.
 
     Args:
-        enu_m: Points, m, float64 (n, 3).
+        enu_m: Places, m, float64 (n, 3).
         position_m: The camera's, m, float64 (3,).
         rotation: Its axes as columns in ENU, float64 (3, 3).
         camera: The camera.
 
     Returns:
-        Points, px, float64 (n, 2), NaN behind the camera; derivatives by the position, m, and by a small turn
-        of the camera about east, north and up, radians, float64 (n, 2, 6).
+        Points, px, float64 (n, 2), NaN behind the camera; derivatives by the position, m, and by a small
+        rotation of the camera about east, north and up, radians, float64 (n, 2, 6).
     """
     offset = enu_m - position_m
-    seen = offset @ rotation
-    ahead = np.where(seen[:, 2:] > 0, seen, np.nan)
-    slope = camera.projection_jacobian(ahead) @ rotation.T
-    turned = np.cross(slope, offset[:, None, :])
-    return camera.project(ahead), np.concatenate([-slope, turned], -1)
+    in_camera = offset @ rotation
+    visible = np.where(in_camera[:, 2:] > 0, in_camera, np.nan)
+    slope = camera.projection_jacobian(visible) @ rotation.T
+    by_rotation = np.cross(slope, offset[:, None, :])
+    return camera.project(visible), np.concatenate([-slope, by_rotation], -1)
 
 
-def camera_off(camera: CameraModel, errors: Floats) -> CameraModel:
-    """A camera whose `CAMERA_PARAMETERS` are off by so much, the focal length in px, float64 (7,)."""
-    focal_px, x_px, y_px, *bent = errors.tolist()
+def perturb_camera(camera: CameraModel, errors: Floats) -> CameraModel:
+    """Add errors to a camera's `CAMERA_PARAMETERS`, the focal length in px, float64 (7,)."""
+    focal_px, x_px, y_px, *distortion = errors.tolist()
     names, centre = CAMERA_PARAMETERS[3:], camera.centre_px
     return replace(
         camera,
         focal_mm=max(camera.focal_px + focal_px, 1.0) * camera.pitch_um / 1e3,
         centre_x_px=centre[0] + x_px,
         centre_y_px=centre[1] + y_px,
-        **{name: getattr(camera, name) + more for name, more in zip(names, bent, strict=True)},
+        **{name: getattr(camera, name) + error for name, error in zip(names, distortion, strict=True)},
     )
 
 
-def skewed(vectors: Floats) -> Floats:
-    """Matrices of vectors v (n, 3), float64 (n, 3, 3): times w it is v x w, and w times it is w x v."""
+def cross_matrices(vectors: Floats) -> Floats:
+    """Matrices of vectors v (n, 3), float64 (n, 3, 3): times w they are v x w, and w times them is w x v."""
     return (vectors @ _LEVI_CIVITA).reshape(-1, 3, 3)
 
 
 class SharedErrors(NamedTuple):
-    """What the points of a bar share, and how they err; of several bars, arrays of these.
+    """Errors that the points of a bar share, and whitening of their own; of several bars, arrays of these.
 
     Attributes:
-        survey: Sigmas of the bar's place, m, its turn, radians, and its length, a share, to which is added by
-            how much it looks too long, float64 (3,).
+        survey: Sigmas of the bar's place, m, its rotation, radians, and its true and apparent length, as a
+            share, float64 (3,).
         root: A root of the covariance of its image's shift, px, float64 (2, 2).
-        even: What makes errors of a point even in all directions and of sigma 1, float64 (2, 2).
+        whitening: Makes errors of a point, in its sigmas, isotropic and of sigma 1, float64 (2, 2).
     """
 
     survey: Floats
     root: Floats
-    even: Floats
+    whitening: Floats
 
 
 class KnownAngles(NamedTuple):
-    """What an attitude says, or nothing.
+    """The known angles of the camera's attitude.
 
     Attributes:
-        level: The camera's axes as columns in ENU by it, north where no heading is known, float64 (3, 3).
-        heading_rad: By it; 0 where it is not known.
+        rotation: The camera's axes as columns in ENU, facing north if the heading is unknown, float64 (3, 3).
+        heading_rad: 0 if it is unknown.
         known: How many of pitch, roll and heading are known: 0, 2 or 3.
-        white: What whitens the errors of these, float64 (3, 3).
-        causes: What moves these by its sigmas, whitened, float64 (3, 4).
-        turns: Whether turns about east, north and up are unknowns.
+        whitening: Whitens the errors of these, float64 (3, 3).
+        causes: Their shifts by one sigma of each standing error, whitened, float64 (3, 4).
+        free: Whether rotations about east, north and up are unknowns.
     """
 
-    level: Floats = np.eye(3)
+    rotation: Floats = np.eye(3)
     heading_rad: float = 0.0
     known: int = 0
-    white: Floats = np.eye(3)
+    whitening: Floats = np.eye(3)
     causes: Floats = np.zeros((3, 4))
-    turns: tuple[bool, bool, bool] = (True, True, True)
+    free: tuple[bool, bool, bool] = (True, True, True)
 
     @classmethod
-    def of(cls, attitude: Attitude | None, shaken_rad: float) -> Self:
-        """What is known, where what shifts the images of all bars alike is a turn by `shaken_rad`."""
+    def of(cls, attitude: Attitude | None, vibration_rad: float) -> Self:
+        """Of an attitude, with a vibration that rotates the camera by this sigma."""
         if attitude is None:
             return cls()
-        compass = attitude.heading_deg is not None
-        turns = (True, True, True)
-        unsure = (attitude.gravity_sigma_deg, attitude.white_sigma_deg, attitude.time_sigma_us)
-        if not any((shaken_rad, *unsure)):
-            turns = (False, False, not compass or attitude.heading_sigma_deg > 0)
-        causes, known = attitude.bias_root_rad(), 3 if compass else 2
-        # All err anew with each time, too: as the attitude's own noise does, and what shifts an image down or
-        # aside, as a camera turns about its own axes across and upright: the second is not the world's.
+        has_heading = attitude.heading_deg is not None
+        free = (True, True, True)
+        sigmas = (attitude.gravity_sigma_deg, attitude.white_sigma_deg, attitude.time_sigma_us)
+        if not any((vibration_rad, *sigmas)):
+            free = (False, False, not has_heading or attitude.heading_sigma_deg > 0)
+        causes, known = attitude.bias_root_rad(), 3 if has_heading else 2
+        # Noise is the attitude's own, and vibration, which shifts an image down or sideways: a rotation about
+        # the camera's horizontal and its upright axis, of which the second is not the world's.
         pitch = math.radians(attitude.pitch_deg)
-        aside = [[1.0, 0.0], [0.0, math.tan(pitch)], [0.0, 1 / math.cos(pitch)]]
-        moves = np.concatenate([causes, shaken_rad * np.array(aside)], 1)
-        least = math.radians(attitude.white_sigma_deg) ** 2 + EXACT_RAD**2
-        white = np.linalg.inv(np.linalg.cholesky(moves @ moves.T + least * np.eye(3)))
+        by_vibration = [[1.0, 0.0], [0.0, math.tan(pitch)], [0.0, 1 / math.cos(pitch)]]
+        moves = np.concatenate([causes, vibration_rad * np.array(by_vibration)], 1)
+        noise = math.radians(attitude.white_sigma_deg) ** 2 + _LEAST_ANGLE_RAD**2
+        whitening = np.linalg.inv(np.linalg.cholesky(moves @ moves.T + noise * np.eye(3)))
         if known < 3:
-            white[2] = (0.0, 0.0, 1.0)
+            whitening[2] = (0.0, 0.0, 1.0)
         heading_rad = math.radians(attitude.heading_deg or 0.0)
-        return cls(attitude.rotation(), heading_rad, known, white, white @ causes, turns)
+        return cls(attitude.rotation(), heading_rad, known, whitening, whitening @ causes, free)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,15 +204,15 @@ class Problem:
 
     Attributes:
         camera: The camera.
-        attitude: What is known of its attitude; None for nothing.
+        attitude: Its attitude as far as it is known; None if it is not.
         spec: Bounds and weights.
-        points: A row a cluster that is seen: its place in the local axes and from its bar's centre, m, where
-            it is seen, px, 1 / sigma, and the share of its variance that stands for a while, float64 (n, 10).
-        bar: Number of each point's bar, rising, int64 (n,).
-        errors: What the points of each bar share, float64 (bars, 3), (bars, 2, 2), (bars, 2, 2).
-        transmitters: Number of each bar.
+        points: A row for each cluster seen: its place in the local axes and from its bar's centre, m, its
+            image point, px, 1 / sigma, and the share of its variance that persists a while, float64 (n, 10).
+        bar: Index of each point's bar, rising, int64 (n,).
+        errors: Shared errors of each bar, float64 (bars, 3), (bars, 2, 2), (bars, 2, 2).
+        transmitters: Number of each bar's transmitter.
         lens_root: A lower root of the covariance of the camera's `CAMERA_PARAMETERS`, float64 (7, 7).
-        shaken_rad: Sigma of what shifts the images of all bars alike.
+        vibration_rad: Sigma of the camera's rotation by vibration, common to all bars.
     """
 
     camera: CameraModel
@@ -227,23 +223,23 @@ class Problem:
     errors: SharedErrors
     transmitters: tuple[int, ...]
     lens_root: Floats
-    shaken_rad: float
+    vibration_rad: float
 
     @cached_property
     def angles(self) -> KnownAngles:
-        """What the attitude says."""
-        return KnownAngles.of(self.attitude, self.shaken_rad)
+        """The known angles of `attitude`."""
+        return KnownAngles.of(self.attitude, self.vibration_rad)
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
-        """Which unknowns of the fit there are, bool (14,): see `model`."""
+        """Which of the fit's shared unknowns are free, bool (14,)."""
         free = np.ones(14, np.bool_)
-        free[3:6], free[6], free[7:] = self.angles.turns, False, self.lens_root.any()
+        free[3:6], free[6], free[7:] = self.angles.free, False, self.lens_root.any()
         return free
 
     @cached_property
-    def parts(self) -> list[slice]:
-        """Where each bar's points are."""
+    def bar_slices(self) -> list[slice]:
+        """Rows of each bar's points."""
         ends = np.cumsum(np.bincount(self.bar, minlength=len(self.transmitters))).tolist()
         return [slice(first, end) for first, end in zip([0, *ends], ends, strict=False)]
 
@@ -256,155 +252,154 @@ class Problem:
         spec: ErrorModel,
         sigma: CameraSigma,
     ) -> "Problem | Rejection":
-        """What the views give, or why that is too little for a position."""
-        between = between_of(views)
-        kept: list[int] = []
-        parts: list[Floats] = []
+        """Of views of bars; or why they are too few for a position."""
+        vibration = common_vibration(views)
+        transmitters: list[int] = []
+        points: list[Floats] = []
         errors: list[SharedErrors] = []
-        most = 0
+        most_clusters = 0
         for view in views:
-            whole = whole_clusters(view.points_px, view.sigma_px, camera.width, camera.height)
-            number = int(whole.sum())
-            most = max(most, number)
-            if number >= spec.min_points:
-                pixel = spec.pixel_sigma_px if view.pixel_px is None else view.pixel_px
-                sigma_px = view.sigma_px[whole, None]
+            usable = find_whole_clusters(view.points_px, view.sigma_px, camera.width, camera.height)
+            count = int(usable.sum())
+            most_clusters = max(most_clusters, count)
+            if count >= spec.min_points:
+                pixel_px = spec.pixel_sigma_px if view.pixel_px is None else view.pixel_px
+                sigma_px = view.sigma_px[usable, None]
                 # From the whole bar's centre: errors of its attitude turn it about that, whatever is seen.
-                arm = (view.enu_m - view.enu_m.mean(0))[whole]
-                share = np.minimum((pixel / sigma_px) ** 2, 1.0)
-                kept.append(view.transmitter)
-                columns = [view.enu_m[whole], arm, view.points_px[whole], 1 / sigma_px, share]
-                parts.append(np.concatenate(columns, 1))
-                errors.append(shared_errors(view, whole, spec, between))
-        if not kept:
-            why = f"{most} whole clusters of a bar seen, {spec.min_points} needed"
+                arm = (view.enu_m - view.enu_m.mean(0))[usable]
+                share = np.minimum((pixel_px / sigma_px) ** 2, 1.0)
+                transmitters.append(view.transmitter)
+                columns = [view.enu_m[usable], arm, view.points_px[usable], 1 / sigma_px, share]
+                points.append(np.concatenate(columns, 1))
+                errors.append(compute_shared_errors(view, usable, spec, vibration))
+        if not transmitters:
+            why = f"{most_clusters} whole clusters of a bar seen, {spec.min_points} needed"
             return Rejection("too-few-clusters", why)
         problem = cls(
             camera=camera,
             attitude=attitude,
             spec=spec,
-            points=np.concatenate(parts),
-            bar=np.repeat(np.arange(len(parts)), [len(part) for part in parts]),
+            points=np.concatenate(points),
+            bar=np.repeat(np.arange(len(points)), [len(rows) for rows in points]),
             errors=SharedErrors(*map(np.array, zip(*errors, strict=True))),
-            transmitters=tuple(kept),
+            transmitters=tuple(transmitters),
             lens_root=sigma.covariance_root(camera),
-            shaken_rad=between * spec.shaken_sigma_px / camera.focal_px,
+            vibration_rad=vibration * spec.vibration_sigma_px / camera.focal_px,
         )
-        return problem._determined()
+        return problem._check_determined()
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom.
-
-        Every shared error has an observation of its own, that it is about 0; an angle that is exact is no
-        unknown.
-        """
+        """Degrees of freedom; every shared error has an observation of its own, that it is about 0."""
         return max(2 * len(self.points) + self.angles.known - 6, 1)
 
     def with_attitude(self, attitude: Attitude | None) -> "Problem | Rejection":
-        """The same where this is known of the attitude, or why that is too little."""
-        return replace(self, attitude=attitude)._determined()
+        """The same with another attitude, or why that is too little."""
+        return replace(self, attitude=attitude)._check_determined()
 
-    def without(self, bar: int) -> "Problem | Rejection":
-        """The same without a bar, by its place among `transmitters`, or why the others are too few."""
+    def without_bar(self, bar: int) -> "Problem | Rejection":
+        """The same without a bar, by its index in `transmitters`, or why the others are too few."""
         kept = self.bar != bar
         others = self.bar[kept]
-        fewer = replace(
+        remaining = replace(
             self,
             points=self.points[kept],
             bar=others - (others > bar),
             errors=SharedErrors(*(np.delete(one, bar, 0) for one in self.errors)),
             transmitters=self.transmitters[:bar] + self.transmitters[bar + 1 :],
         )
-        return fewer._determined()
+        return remaining._check_determined()
 
-    def seen_by(self, sigma: CameraSigma) -> "Problem":
-        """The same through a camera that is so surely known."""
+    def with_camera_sigma(self, sigma: CameraSigma) -> "Problem":
+        """The same with other sigmas of the camera."""
         return replace(self, lens_root=sigma.covariance_root(self.camera))
 
-    def _determined(self) -> "Problem | Rejection":
-        """The same, or why its attitude is too little for its bars."""
+    def _check_determined(self) -> "Problem | Rejection":
+        """This problem, or why its attitude is too little for its bars."""
         bars = len(self.transmitters)
         if bars == 1 and self.angles.known < 3:
             why = "one bar gives a position only with the camera's heading known"
             return Rejection("heading-unknown", why)
         if self.attitude is None:
-            centres = np.array([self.points[part, :3].mean(0) for part in self.parts])
-            # Along the line that fits the bars best, and across it.
+            centres = np.array([self.points[part, :3].mean(0) for part in self.bar_slices])
             along, across = np.linalg.svd(centres - centres.mean(0), compute_uv=False)[:2]
-            if bars < 3 or across <= _INLINE * along:
-                many = "two bars give" if bars == 2 else "bars in line give"
-                return Rejection("gravity-unknown", f"{many} a position only with gravity known")
+            if bars < 3 or across <= _COLLINEAR_SHARE * along:
+                which = "two bars give" if bars == 2 else "bars in line give"
+                return Rejection("gravity-unknown", f"{which} a position only with gravity known")
         return self
 
     @cached_property
     def centre(self) -> Floats:
-        """The mean of the points' places, float64 (3,)."""
+        """Mean of the points' places, float64 (3,)."""
         return np.asarray(self.points[:, :3].mean(0))
 
     @cached_property
-    def surveyed(self) -> bool:
-        """Whether places or attitudes of bars are not exact."""
+    def has_survey_errors(self) -> bool:
+        """Whether places or attitudes of bars have errors."""
         return bool(self.errors.survey[:, :2].any())
 
 
-def between_of(views: Sequence[BarView]) -> float:
-    """Of what moved between frames, the part that all bars have in common, see `BarView.between`."""
-    return sum([view.between for view in views]) / max(len(views), 1)
+def common_vibration(views: Sequence[BarView]) -> float:
+    """The part of `BarView.vibration` that all bars have in common."""
+    return sum([view.vibration for view in views]) / max(len(views), 1)
 
 
-def whole_clusters(points_px: Floats, sigma_px: Floats, width: int, height: int) -> NDArray[np.bool_]:
-    """Which clusters of a bar count, bool (K,): seen, with a sigma, and not cut off.
+def find_whole_clusters(points_px: Floats, sigma_px: Floats, width: int, height: int) -> NDArray[np.bool_]:
+    """Find the clusters of a bar that are seen, have a sigma and are not cut off, bool (K,).
 
-    Of a cluster that touches the image's edge only a part is seen. It is as long as the spacing of
-    neighbours; three quarters of that and a pixel of blur must be free.
+    A cluster is as long as the spacing of neighbours; three quarters of that and a pixel of blur must lie
+    between its centre and the image's edge.
     """
     seen = np.flatnonzero(np.isfinite(points_px[:, 0]))
     edge = 0.5
     if len(seen) > 1:
         first, last = seen[0], seen[-1]
         edge += 0.75 * math.dist(points_px[first], points_px[last]) / (last - first)
-    inside = (points_px >= edge) & (points_px <= np.array([width, height]) - 1 - edge)
-    counted: NDArray[np.bool_] = inside.all(1) & (sigma_px > 0) & (sigma_px < math.inf)
-    return counted
+    is_inside = (points_px >= edge) & (points_px <= np.array([width, height]) - 1 - edge)
+    usable: NDArray[np.bool_] = is_inside.all(1) & (sigma_px > 0) & (sigma_px < math.inf)
+    return usable
 
 
-def shared_errors(view: BarView, seen: NDArray[np.bool_], spec: ErrorModel, between: float) -> SharedErrors:
-    """How a bar errs, by its clusters that are seen, bool (K,).
+def compute_shared_errors(
+    view: BarView, seen: NDArray[np.bool_], spec: ErrorModel, vibration: float
+) -> SharedErrors:
+    """Errors that a bar's points share, by its clusters that are seen, bool (K,).
 
-    Of a layout that is no line, what is along it holds in all directions. The whole is as long as from one of
-    its clusters to the farthest other, and a cluster's own part; its image is so by what is seen of it.
+    The errors along a layout that is no line hold in all directions. The bar is as long as the distance of
+    its farthest clusters, and a cluster's own length; its image's length follows from the part that is seen.
 
-    The image moves as one: of what is not known of it, a bar has for its own what it has more or less than
-    others, see `between_of`. These count as independent, so that two bars differ by as much as they do.
+    Vibration is common to all bars as far as `vibration` says; a bar's own is the difference from that. These
+    count as independent, so that two bars differ by as much as theirs do.
     """
-    moved = math.hypot(math.sqrt(2) * spec.shaken_sigma_px * abs(view.between - between), view.early_px)
+    own_vibration_px = math.sqrt(2) * spec.vibration_sigma_px * abs(view.vibration - vibration)
+    shift_px = math.hypot(own_vibration_px, view.timing_px)
     count, points = len(seen), view.points_px
-    i, j = _ends(view.enu_m, np.flatnonzero(seen))
-    first, last = _ends(view.enu_m, np.arange(count))
+    i, j = _find_farthest_pair(view.enu_m, np.flatnonzero(seen))
+    first, last = _find_farthest_pair(view.enu_m, np.arange(count))
     share = math.dist(view.enu_m[first], view.enu_m[last]) / math.dist(view.enu_m[i], view.enu_m[j])
     share *= count / (count - 1)
-    size = math.dist(points[i], points[j])
-    along = math.hypot(spec.shared_along_px, moved, spec.shared_share * size * share)
-    axis = (points[j] - points[i]) / size if size > 0 else np.array([1.0, 0.0])
-    aside = (points[seen] - points[i]) @ np.array([axis[1], -axis[0]])
-    # Half a cluster beside the line from end to end is no error of a point in it.
-    line = size > 0 and bool((np.abs(aside) <= 0.5 * size * share / count).all())
-    across = math.hypot(spec.shared_sigma_px, view.shift_px, moved) if line else along
-    sideways = 1 / view.across if line else 1 / max(view.across, 1.0)
+    length_px = math.dist(points[i], points[j])
+    along_px = math.hypot(spec.shared_along_px, shift_px, spec.shared_share * length_px * share)
+    axis = (points[j] - points[i]) / length_px if length_px > 0 else np.array([1.0, 0.0])
+    offset_px = (points[seen] - points[i]) @ np.array([axis[1], -axis[0]])
+    # No point of a line is more than half a cluster off the line from end to end.
+    is_line = length_px > 0 and bool((np.abs(offset_px) <= 0.5 * length_px * share / count).all())
+    across_px = math.hypot(spec.shared_sigma_px, view.shift_px, shift_px) if is_line else along_px
+    weight_across = 1 / view.across if is_line else 1 / max(view.across, 1.0)
+    weight_along = 1.0 if is_line else weight_across
     (x, y), (place, turn, length) = axis.tolist(), view.survey
-    way = np.array([[x * x, x * y], [x * y, y * y]])
+    projection = np.array([[x * x, x * y], [x * y, y * y]])
     return SharedErrors(
         np.array([place, turn, math.hypot(length, spec.stretch_share, view.stretch)]),
-        across * _BOTH + (along - across) * way,
-        sideways * _BOTH + ((1.0 if line else sideways) - sideways) * way,
+        across_px * _IDENTITY + (along_px - across_px) * projection,
+        weight_across * _IDENTITY + (weight_along - weight_across) * projection,
     )
 
 
-def _ends(places: Floats, counted: NDArray[np.int64]) -> tuple[int, int]:
-    """Two of the places that count, as far apart as any: the farthest from the farthest from one."""
-    one = other = int(counted[0])
+def _find_farthest_pair(places: Floats, rows: NDArray[np.int64]) -> tuple[int, int]:
+    """Find the two of some places that are farthest apart: the farthest from the farthest from one."""
+    one = other = int(rows[0])
     for _ in range(2):
-        away = np.linalg.norm(places[counted] - places[other], axis=1)
-        one, other = other, int(counted[away.argmax()])
+        distance = np.linalg.norm(places[rows] - places[other], axis=1)
+        one, other = other, int(rows[distance.argmax()])
     return one, other

@@ -1,4 +1,4 @@
-"""Packets to positions: a pose at each time that bars are seen."""
+"""Packets to positions: a pose at each time at which bars are seen."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.bar_registry import BarRegistry
-from evlcp_sdk.place.error_model import EXACT, USUAL, ErrorModel
+from evlcp_sdk.place.error_model import DEFAULT_ERRORS, EXACT_CAMERA, ErrorModel
 from evlcp_sdk.place.observations import BarView, Rejection
-from evlcp_sdk.place.points import points_at
-from evlcp_sdk.place.pose import fitting_focal_mm, solve_pose
+from evlcp_sdk.place.points import interpolate_points
+from evlcp_sdk.place.pose import search_focal_mm, solve_pose
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BarKind:
-    """One kind of bars that positions are computed from: of one link, whose name may be empty."""
+    """The bars of one link, whose name may be empty."""
 
     bar: BarLayout
     packet_us: float
@@ -41,23 +41,22 @@ class BarKind:
 class Positioner:
     """Fixes on a fixed time grid, one per packet time, from the packets of a receiver.
 
-    Of several kinds of bars, the longest packets make the grid; bars of all kinds enter one fix. A fix takes
-    the bars that are seen within half a packet time of theirs before and after it. The image moves in that
-    time, with the vehicle's vibration, but a bar's shape hardly changes: the shape is a straight line in
-    time through all frames, the place is interpolated between the frames next to the fix. Feeding packet by
-    packet or all at once gives the same fixes. Reflections are left out.
+    With several kinds of bars, the longest packets make the grid; bars of all kinds enter one fix. A fix
+    takes the bars that are seen within half a packet time before and after it. The image moves in that time,
+    with the vehicle's vibration, but a bar's shape hardly changes: the shape is a straight line in time
+    through all frames, the place is interpolated between the frames next to the fix. Feeding packet by packet
+    or all at once gives the same fixes. Reflections are left out.
 
     Args:
         camera: The receiving camera.
-        kinds: Which bars there are, by the name of the link that their packets have; packets of others are
-            left out.
-        sites: Where the bars stand; may be empty where beacons are believed.
-        attitude_at: What is known of the camera's attitude at a time, us; None for nothing.
+        kinds: The kinds of bars, by the name of their packets' link; packets of others are left out.
+        sites: Where the bars stand; may be empty where beacons are accepted.
+        attitude_at: The camera's attitude at a time, us, as far as it is known; None if it is not.
         spec: Bounds and weights.
         camera_sigma: How precisely the camera is known.
 
     Attributes:
-        axes: The local axes; None before anything is known of a place.
+        axes: The local axes; None as long as no place is known.
         bars: Where the transmitters stand.
     """
 
@@ -67,8 +66,8 @@ class Positioner:
         kinds: Mapping[str, BarKind],
         sites: Sequence[BarSite],
         attitude_at: Callable[[float], Attitude | None],
-        spec: ErrorModel = USUAL,
-        camera_sigma: CameraSigma = EXACT,
+        spec: ErrorModel = DEFAULT_ERRORS,
+        camera_sigma: CameraSigma = EXACT_CAMERA,
     ) -> None:
         self.axes: LocalAxes | None = LocalAxes.of(sites) if sites else None
         self._camera = camera
@@ -81,30 +80,30 @@ class Positioner:
         self.bars = BarRegistry(sites, self._spec, only)
         self._frames: dict[int, list[Frame]] = {}
         self._next: int | None = None
-        self._contradicts: tuple[list[BarView], Attitude | None] | None = None
+        self._contradiction: tuple[list[BarView], Attitude | None] | None = None
         self._counts = dict.fromkeys(("fixes", "refused", "frames_late"), 0)
 
     @property
     def counts(self) -> dict[str, int]:
-        """Fixes given and refused, frames that came too late for theirs, forged beacons."""
+        """Fixes given and refused, frames too late for theirs, forged beacons."""
         return self._counts | {"beacons_forged": self.bars.forged}
 
-    def fitting_focal_mm(self) -> float:
-        """The focal length with which the first views that contradict one another fit, mm; NaN for none."""
-        if self._contradicts is None:
+    def search_focal_mm(self) -> float:
+        """The focal length with which the first contradictory views fit, mm; NaN if there is none."""
+        if self._contradiction is None:
             return math.nan
-        views, attitude = self._contradicts
-        return fitting_focal_mm(views, self._camera, attitude, self._spec, self._camera_sigma)
+        views, attitude = self._contradiction
+        return search_focal_mm(views, self._camera, attitude, self._spec, self._camera_sigma)
 
     def feed(self, packets: Iterable[Packet]) -> list[Fix]:
-        """Take the next packets; return the fixes that no later packet can change."""
+        """Process the next packets; return the fixes that no later packet can change."""
         fixes = []
         for packet in packets:
             if packet.link not in self._kinds:
                 continue
             self.bars.add_packet(packet)
             if packet.echo_of is not None:
-                # What was not known to be a reflection before is no bar at a place, either.
+                # Its earlier frames are of a reflection, too.
                 self._frames.pop(packet.transmitter, None)
             clusters = self._kinds[packet.link].bar.clusters
             for frame in packet.frames if packet.echo_of is None else ():
@@ -113,13 +112,13 @@ class Positioner:
                 number = math.ceil(frame.points_t_us / self._packet_us - 0.5)
                 if self._next is None:
                     self._next = number
-                # What is late for its own grid time may still serve the next as a neighbour.
+                # A frame too late for its own grid time may still serve the next as a neighbour.
                 self._counts["frames_late"] += number < self._next
                 self._frames.setdefault(packet.transmitter, []).append(frame)
-            # A packet of another bar that starts half a packet after a fix is complete one packet later; of
-            # longer packets than this one, some that are not have begun before it.
+            # A packet of another bar that starts half a packet after a fix is complete one packet later;
+            # longer packets that are not yet complete have begun earlier than this one.
             earlier = 1 - self._kinds[packet.link].packet_us / self._packet_us
-            fixes += self._until(packet.t_us / self._packet_us - 1.5 - earlier)
+            fixes += self._compute_until(packet.t_us / self._packet_us - 1.5 - earlier)
         return fixes
 
     def links_of(self, fix: Fix) -> str:
@@ -129,85 +128,86 @@ class Positioner:
     def close(self) -> list[Fix]:
         """End the stream; return the rest of the fixes."""
         last = max((f.points_t_us for kept in self._frames.values() for f in kept), default=-math.inf)
-        return self._until(last / self._packet_us + 0.5) if math.isfinite(last) else []
+        return self._compute_until(last / self._packet_us + 0.5) if math.isfinite(last) else []
 
-    def _until(self, limit: float) -> list[Fix]:
-        """The fixes of the grid times up to a limit, in packet times."""
+    def _compute_until(self, limit: float) -> list[Fix]:
+        """Compute the fixes of the grid times up to a limit, in packet times."""
         fixes = []
         while self._next is not None and self._next <= limit:
             t_us = self._next * self._packet_us
-            fix = self._fix(t_us)
+            fix = self._compute_fix(t_us)
             if fix is not None:
                 self._counts["refused" if fix.refusal else "fixes"] += 1
                 fixes.append(fix)
             self._next += 1
             oldest = (self._next - 1) * self._packet_us
-            later = {n: [f for f in kept if f.points_t_us > oldest] for n, kept in self._frames.items()}
-            self._frames = {number: kept for number, kept in later.items() if kept}
-            coming = [f.points_t_us for kept in self._frames.values() for f in kept]
-            # Where nothing is in view, the grid goes on with the next frame.
-            first = math.ceil(min(coming) / self._packet_us - 0.5) if coming else None
+            remaining = {n: [f for f in kept if f.points_t_us > oldest] for n, kept in self._frames.items()}
+            self._frames = {number: kept for number, kept in remaining.items() if kept}
+            times_us = [f.points_t_us for kept in self._frames.values() for f in kept]
+            # With nothing in view, the grid goes on with the next frame.
+            first = math.ceil(min(times_us) / self._packet_us - 0.5) if times_us else None
             self._next = None if first is None else max(self._next, first)
         return fixes
 
-    def _fix(self, t_us: float) -> Fix | None:
-        views, sited, unplaced = [], [], []
-        here: LocalAxes | None = None
+    def _compute_fix(self, t_us: float) -> Fix | None:
+        views, placed, unplaced = [], [], []
+        bar_axes: LocalAxes | None = None
         for number, frames in sorted(self._frames.items()):
             kind = self._kinds[self.bars.link_of(number)]
-            view = points_at(number, frames, t_us, kind.packet_us, kind.bar.cluster_positions_m(), self._spec)
+            layout_m = kind.bar.cluster_positions_m()
+            view = interpolate_points(number, frames, t_us, kind.packet_us, layout_m, self._spec)
             if view is None:
                 continue
             views.append(number)
-            site = self.bars.site(number)
+            site = self.bars.site_of(number)
             if site is None:
                 continue
-            # Gravity and north are those of here, which may be far from the origin of the trajectory.
-            here = here or LocalAxes.of([site])
-            self.axes = self.axes or here
+            # Gravity and north are those of the bars, which may be far from the trajectory's origin.
+            bar_axes = bar_axes or LocalAxes.of([site])
+            self.axes = self.axes or bar_axes
             try:
-                enu = site.layout_positions_m(kind.bar, here)
-                sited.append(replace(view, enu_m=enu, survey=site.survey_sigmas))
-            except ConfigError as fault:
-                unplaced.append(str(fault))
+                enu = site.layout_positions_m(kind.bar, bar_axes)
+                placed.append(replace(view, enu_m=enu, survey=site.survey_sigmas))
+            except ConfigError as error:
+                unplaced.append(str(error))
         if not views:
             return None
-        if unplaced and not sited:
+        if unplaced and not placed:
             return Fix.from_refusal(t_us, tuple(views), "no-facing", "; ".join(unplaced))
-        if here is None or self.axes is None:
-            how = [text for number in views if (text := self.bars.contradiction(number))]
-            if how:
-                return Fix.from_refusal(t_us, tuple(views), "site-contradicted", "; ".join(how))
+        if bar_axes is None or self.axes is None:
+            contradictions = [text for number in views if (text := self.bars.contradiction_of(number))]
+            if contradictions:
+                return Fix.from_refusal(t_us, tuple(views), "site-contradicted", "; ".join(contradictions))
             which = ", ".join(f"{n} (id {self.bars.ids.get(n, 'not received')})" for n in views)
             return Fix.from_refusal(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
-        return self._solved(t_us, views, sited, here, self.axes)
+        return self._solve_fix(t_us, views, placed, bar_axes, self.axes)
 
-    def _solved(
-        self, t_us: float, views: list[int], sited: list[BarView], here: LocalAxes, axes: LocalAxes
+    def _solve_fix(
+        self, t_us: float, views: list[int], placed: list[BarView], bar_axes: LocalAxes, axes: LocalAxes
     ) -> Fix:
-        """The fix of bars whose places are known in the axes of here; or why there is none."""
-        attitude_now = self._attitude_at(t_us)
-        pose = solve_pose(sited, self._camera, attitude_now, self._spec, self._camera_sigma)
-        contradicts = pose.kind == "misfit" if isinstance(pose, Rejection) else bool(pose.excluded)
-        if contradicts and self._contradicts is None:
-            self._contradicts = sited, attitude_now
+        """The fix by bars whose places are known in `bar_axes`, or why there is none."""
+        attitude = self._attitude_at(t_us)
+        pose = solve_pose(placed, self._camera, attitude, self._spec, self._camera_sigma)
+        has_contradiction = pose.kind == "misfit" if isinstance(pose, Rejection) else bool(pose.excluded)
+        if has_contradiction and self._contradiction is None:
+            self._contradiction = placed, attitude
         if isinstance(pose, Rejection):
             refused = Fix.from_refusal(t_us, tuple(views), pose.kind, pose.detail)
-            others = _alternatives(pose, here, axes)
-            return replace(refused, alternatives=others, suspects=pose.suspects)
-        turn = axes.rotation_from(here)
+            alternatives = _to_alternatives(pose, bar_axes, axes)
+            return replace(refused, alternatives=alternatives, suspects=pose.suspects)
+        turn = axes.rotation_from(bar_axes)
         failed = pose.failed
         if failed is not None:
-            spread = turn @ failed.covariance_m2 @ turn.T
-            failed = replace(failed, off_m=turn @ failed.off_m, covariance_m2=spread)
+            covariance_m2 = turn @ failed.covariance_m2 @ turn.T
+            failed = replace(failed, off_m=turn @ failed.off_m, covariance_m2=covariance_m2)
         return Fix(
             t_us=t_us,
-            **_on_earth(pose.enu_m, pose.rotation, here, axes),
+            **_to_earth(pose.enu_m, pose.rotation, bar_axes, axes),
             covariance_m2=turn @ pose.covariance[:3, :3] @ turn.T,
             noise_m2=turn @ pose.noise @ turn.T,
             heading_sigma_deg=math.degrees(math.sqrt(pose.covariance[5, 5])),
             transmitters=pose.transmitters,
-            verified=all(self.bars.verified(n) for n in pose.transmitters),
+            verified=all(self.bars.is_verified(n) for n in pose.transmitters),
             slow_m2=turn @ pose.slow @ turn.T,
             standing={name: turn @ moves for name, moves in pose.standing.items()},
             misfit=pose.misfit,
@@ -223,10 +223,10 @@ class Positioner:
         )
 
 
-def _on_earth(enu_m: Floats, rotation: Floats, here: LocalAxes, axes: LocalAxes) -> dict[str, Any]:
-    """Place and angles of a camera as fixes have them, by its pose in the axes of here."""
+def _to_earth(enu_m: Floats, rotation: Floats, bar_axes: LocalAxes, axes: LocalAxes) -> dict[str, Any]:
+    """Convert a pose in `bar_axes` to the place and angles of a fix."""
     angles = Attitude.of_rotation(rotation)
-    latitude, longitude, height = (float(v) for v in here.to_geodetic(enu_m))
+    latitude, longitude, height = (float(v) for v in bar_axes.to_geodetic(enu_m))
     return {
         "latitude_deg": latitude,
         "longitude_deg": longitude,
@@ -238,12 +238,12 @@ def _on_earth(enu_m: Floats, rotation: Floats, here: LocalAxes, axes: LocalAxes)
     }
 
 
-def _alternatives(refusal: Rejection, here: LocalAxes, axes: LocalAxes) -> tuple[Alternative, ...]:
-    """The poses that a refusal leaves open, on earth."""
-    turn = axes.rotation_from(here)
+def _to_alternatives(refusal: Rejection, bar_axes: LocalAxes, axes: LocalAxes) -> tuple[Alternative, ...]:
+    """Convert the candidates of a rejection to alternatives of a fix."""
+    turn = axes.rotation_from(bar_axes)
     return tuple(
         Alternative(
-            **_on_earth(one.enu_m, one.rotation, here, axes),
+            **_to_earth(one.enu_m, one.rotation, bar_axes, axes),
             covariance_m2=turn @ one.covariance_m2 @ turn.T,
             likelihood=one.likelihood,
         )

@@ -1,11 +1,12 @@
-"""The camera's way from its fixes: a Kalman filter forward, live, and a smoother backward, offline.
+"""The camera's trajectory from its fixes: a Kalman filter forward, live, and a smoother backward, offline.
 
-Fixes are of bars or of GNSS; between them the way turns, and is pushed, as an IMU says, where there is one.
+Fixes are of bars or of GNSS; between them the trajectory turns and accelerates as an IMU measures, if there
+is one.
 
-What stays wrong over many fixes - a bar's site, the camera's focal length, an IMU's bias and clock - is a
-state beside position and velocity, so that it is never averaged away as if it were noise, and is estimated
-where a drive shows it. What changes as the image moves over the pixels is one with a memory of a fraction of
-a second.
+Errors that persist over many fixes - of a bar's site, the camera's focal length, an IMU's bias and clock -
+are states beside position and velocity, so that they are never averaged away as noise, and are estimated
+where a drive shows them. Errors that change as the image moves over the pixels are states with a memory of a
+fraction of a second.
 """
 
 import math
@@ -26,21 +27,21 @@ Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
-class Reckoned:
-    """What time makes of position, m, and velocity, m/s: east, north, up of each.
+class DeadReckoning:
+    """Propagation of position, m, and velocity, m/s, over a time: east, north, up of each.
 
     Attributes:
-        move: How they depend on what they were, float64 (6, 6).
-        added: What a push adds to them, float64 (6,).
-        noise: Covariance of what is not known of it, float64 (6, 6).
-        by_imu: How they depend on the IMU's biases in their sigmas, float64 (6, 0, 1 or 4).
-        turn_rad: By how much the heading changes, clockwise.
+        transition: By what they were, float64 (6, 6).
+        displacement: By a measured acceleration, float64 (6,).
+        noise: Covariance of the unknown part, float64 (6, 6).
+        by_bias: By the IMU's biases in their sigmas, float64 (6, 0, 1 or 4).
+        turn_rad: Change of the heading, clockwise.
     """
 
-    move: Floats
-    added: Floats
+    transition: Floats
+    displacement: Floats
     noise: Floats
-    by_imu: Floats
+    by_bias: Floats
     turn_rad: float
 
 
@@ -48,167 +49,166 @@ def imu_sigmas(motion: ImuMotion, spec: ErrorModel) -> Floats:
     """Sigmas of an IMU's biases: the gyroscope's, radians/s, the accelerometer's, m/s2: none, 1 or 4."""
     sigmas = [np.radians(spec.rate_sigma_deg_s)] if motion.has_gyro else []
     if motion.acceleration_m_s2 is not None:
-        sigmas += 3 * [spec.push_sigma_m_s2]
+        sigmas += 3 * [spec.accelerometer_sigma_m_s2]
     return np.array(sigmas)
 
 
-def reckon(
+def dead_reckon(
     motion: ImuMotion,
     velocity_m_s: Floats,
     heading_rad: float,
     heading_sigma_rad: float,
     imu: Floats,
     spec: ErrorModel,
-) -> Reckoned:
-    """Carry position and velocity over a time.
+) -> DeadReckoning:
+    """Propagate position and velocity over a time.
 
-    East and north are one complex number, east + i north: a turn by an angle clockwise is a factor exp(-i
-    angle).
-    Without a push the velocity turns as the camera does, driven by white acceleration; with one it changes by
-    what is measured. Velocity, east, north, up, and the camera's heading, clockwise from north, which matters
-    for a push only, are those at the start; `imu` has its estimated biases in their sigmas (0, 1 or 4,).
+    East and north are one complex number, east + i north: a clockwise rotation by an angle is a factor exp(-i
+    angle). Without an accelerometer the velocity turns with the camera, driven by white acceleration; with
+    one it changes as measured, and the camera's heading, clockwise from north, matters. Velocity (east,
+    north, up) and heading are those at the start; `imu` are the estimated biases in their sigmas (0, 1 or
+    4,).
     """
     sigmas = imu_sigmas(motion, spec)
     bias = imu * sigmas
-    s, weight = _nodes(motion.t_s)
-    span = float(s[-1])
-    angle = np.interp(s, motion.t_s, motion.turn_rad)
+    t_s, weight = _simpson_nodes(motion.t_s)
+    dt_s = float(t_s[-1])
+    angle = np.interp(t_s, motion.t_s, motion.turn_rad)
     if motion.has_gyro:
-        angle = angle - bias[0] * s
-    turned, way = np.exp(-1j * angle), _integral_of_turn(s, angle)
-    pushed = None
+        angle = angle - bias[0] * t_s
+    rotation, path = np.exp(-1j * angle), _integrate_turn(t_s, angle)
+    acceleration_m_s2 = None
     if motion.acceleration_m_s2 is None:
-        ahead = complex(velocity_m_s[0], velocity_m_s[1])
-        rest = way[-1] - way
-        by_angle = -1j * ahead * np.stack([rest, np.full_like(rest, turned[-1])])
-        kicked = np.stack([rest, np.full_like(rest, turned[-1])]) / turned
-        white = spec.acceleration_m2_s3
-        move_to = complex(way[-1]), complex(turned[-1])
-        added = np.zeros(6)
+        velocity = complex(velocity_m_s[0], velocity_m_s[1])
+        remaining = path[-1] - path
+        by_angle = -1j * velocity * np.stack([remaining, np.full_like(remaining, rotation[-1])])
+        kicks = np.stack([remaining, np.full_like(remaining, rotation[-1])]) / rotation
+        power = spec.acceleration_m2_s3
+        factors = complex(path[-1]), complex(rotation[-1])
+        displacement = np.zeros(6)
     else:
-        pushed = motion.acceleration_m_s2 - bias[-3:]
-        level = np.interp(s, motion.t_s, pushed[:, 0]) + 1j * np.interp(s, motion.t_s, pushed[:, 1])
+        acceleration_m_s2 = motion.acceleration_m_s2 - bias[-3:]
+        right, forward, up = (np.interp(t_s, motion.t_s, one) for one in acceleration_m_s2.T)
         facing = np.exp(-1j * heading_rad)
-        speed = _running(s, facing * turned * level)
-        place = _running(s, speed)
-        by_angle = -1j * np.stack([place[-1] - place - speed * (span - s), speed[-1] - speed])
-        kicked = np.stack([span - s, np.ones_like(s)]).astype(np.complex128)
-        white = spec.push_white_m2_s3
-        move_to = complex(span), complex(1.0)
-        up = np.interp(s, motion.t_s, pushed[:, 2])
-        climb = _running(s, up)
-        high = _running(s, climb)
-        there, then = place[-1], speed[-1]
-        added = np.array([there.real, there.imag, high[-1], then.real, then.imag, climb[-1]])
-    move = np.eye(6)
-    move[:2, 3:5], move[3:5, 3:5] = _matrix(move_to[0]), _matrix(move_to[1])
-    move[2, 5] = span
-    noise = white * _white(kicked, weight)
-    noise[np.ix_((2, 5), (2, 5))] = white * np.array([[span**3 / 3, span**2 / 2], [span**2 / 2, span]])
-    flat = np.stack([by_angle[0].real, by_angle[0].imag, by_angle[1].real, by_angle[1].imag])
+        speed = _integrate(t_s, facing * rotation * (right + 1j * forward))
+        place = _integrate(t_s, speed)
+        by_angle = -1j * np.stack([place[-1] - place - speed * (dt_s - t_s), speed[-1] - speed])
+        kicks = np.stack([dt_s - t_s, np.ones_like(t_s)]).astype(np.complex128)
+        power = spec.accelerometer_white_m2_s3
+        factors = complex(dt_s), complex(1.0)
+        climb = _integrate(t_s, up)
+        rise = _integrate(t_s, climb)
+        move, change = place[-1], speed[-1]
+        displacement = np.array([move.real, move.imag, rise[-1], change.real, change.imag, climb[-1]])
+    transition = np.eye(6)
+    transition[:2, 3:5], transition[3:5, 3:5] = _complex_matrix(factors[0]), _complex_matrix(factors[1])
+    transition[2, 5] = dt_s
+    noise = power * _white_noise(kicks, weight)
+    noise[np.ix_((2, 5), (2, 5))] = power * np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
+    by_turn = np.stack([by_angle[0].real, by_angle[0].imag, by_angle[1].real, by_angle[1].imag])
     level_rows = [0, 1, 3, 4]
-    by_imu = np.zeros((6, len(sigmas)))
+    by_bias = np.zeros((6, len(sigmas)))
     if motion.has_gyro:
-        drift = np.radians(spec.rate_white_deg_rts) ** 2
-        noise[np.ix_(level_rows, level_rows)] += drift * (flat * weight) @ flat.T
-        by_imu[level_rows, 0] = -(flat @ weight) * sigmas[0]
-    if pushed is not None:
+        drift_power = np.radians(spec.rate_white_deg_rts) ** 2
+        noise[np.ix_(level_rows, level_rows)] += drift_power * (by_turn * weight) @ by_turn.T
+        by_bias[level_rows, 0] = -(by_turn @ weight) * sigmas[0]
+    if acceleration_m_s2 is not None:
         facing = np.exp(-1j * heading_rad)
-        along = (complex(facing * (way @ weight)), complex(facing * way[-1]))
-        for row, c in zip((0, 3), along, strict=True):
-            by_imu[row : row + 2, -3:-1] = -_matrix(c) * sigmas[-1]
-        by_imu[2, -1], by_imu[5, -1] = -(span**2) / 2 * sigmas[-1], -span * sigmas[-1]
-        askew = flat[:, 0] * heading_sigma_rad
-        noise[np.ix_(level_rows, level_rows)] += np.outer(askew, askew)
-    return Reckoned(move, added, noise, by_imu, float(angle[-1]))
+        accelerations = (complex(facing * (path @ weight)), complex(facing * path[-1]))
+        for row, factor in zip((0, 3), accelerations, strict=True):
+            by_bias[row : row + 2, -3:-1] = -_complex_matrix(factor) * sigmas[-1]
+        by_bias[2, -1], by_bias[5, -1] = -(dt_s**2) / 2 * sigmas[-1], -dt_s * sigmas[-1]
+        heading_error = by_turn[:, 0] * heading_sigma_rad
+        noise[np.ix_(level_rows, level_rows)] += np.outer(heading_error, heading_error)
+    return DeadReckoning(transition, displacement, noise, by_bias, float(angle[-1]))
 
 
-def _nodes(t_s: Floats) -> tuple[Floats, Floats]:
+def _simpson_nodes(t_s: Floats) -> tuple[Floats, Floats]:
     """Times with one midway between each two, and Simpson's weights of them."""
-    step = np.diff(t_s)
-    s = np.empty(2 * len(t_s) - 1)
-    s[::2], s[1::2] = t_s, t_s[:-1] + step / 2
-    weight = np.zeros(len(s))
-    weight[1::2] = 4 * step / 6
-    weight[:-1:2] += step / 6
-    weight[2::2] += step / 6
-    return s, weight
+    steps = np.diff(t_s)
+    nodes = np.empty(2 * len(t_s) - 1)
+    nodes[::2], nodes[1::2] = t_s, t_s[:-1] + steps / 2
+    weight = np.zeros(len(nodes))
+    weight[1::2] = 4 * steps / 6
+    weight[:-1:2] += steps / 6
+    weight[2::2] += steps / 6
+    return nodes, weight
 
 
-def _integral_of_turn(s: Floats, angle: Floats) -> Complex:
-    """The integral of exp(-i angle) from the start to each time; the angle is a straight line between two."""
+def _integrate_turn(t_s: Floats, angle: Floats) -> Complex:
+    """Integral of exp(-i angle) from the start to each time, for an angle that is linear between two."""
     half = np.diff(angle) / 2
-    chord = np.diff(s) * np.sinc(half / np.pi) * np.exp(-1j * (angle[:-1] + half))
+    chord = np.diff(t_s) * np.sinc(half / np.pi) * np.exp(-1j * (angle[:-1] + half))
     return np.concatenate([np.zeros(1, np.complex128), np.cumsum(chord)])
 
 
-def _running(s: Floats, values: NDArray[Any]) -> NDArray[Any]:
-    """The integral from the start to each time, by the trapezoidal rule."""
-    area = np.cumsum(np.diff(s) * (values[1:] + values[:-1]) / 2)
+def _integrate(t_s: Floats, values: NDArray[Any]) -> NDArray[Any]:
+    """Integral from the start to each time, by the trapezoidal rule."""
+    area = np.cumsum(np.diff(t_s) * (values[1:] + values[:-1]) / 2)
     return np.concatenate([np.zeros(1, values.dtype), area])
 
 
-def _white(kicked: Complex, weight: Floats) -> Floats:
-    """Covariance of east and north of place and speed by white kicks of power 1, in (6, 6)."""
-    place, speed = kicked
+def _white_noise(kicks: Complex, weight: Floats) -> Floats:
+    """Covariance (6, 6) of place and speed, east and north, by white kicks of power 1."""
+    place, speed = kicks
     noise = np.zeros((6, 6))
     noise[:2, :2] = np.eye(2) * float(weight @ abs(place) ** 2)
     noise[3:5, 3:5] = np.eye(2) * float(weight @ abs(speed) ** 2)
-    noise[:2, 3:5] = _matrix(complex(weight @ (place * speed.conj())))
+    noise[:2, 3:5] = _complex_matrix(complex(weight @ (place * speed.conj())))
     noise[3:5, :2] = noise[:2, 3:5].T
     return noise
 
 
-def _matrix(c: complex) -> Floats:
-    """What multiplies (east, north) as `c` does east + i north."""
+def _complex_matrix(c: complex) -> Floats:
+    """Matrix that multiplies (east, north) as `c` does east + i north."""
     return np.array([[c.real, -c.imag], [c.imag, c.real]])
 
 
 MotionSource = Callable[[float, float], ImuMotion | None]
-"""How the camera turned from one time to a later one, us; None where that is not known."""
+"""The camera's motion from one time to a later one, us; None if it is unknown."""
 
 GNSS, IMU = "gnss", "imu"
-"""Causes of standing errors: a receiver of satellites, whose errors have a memory of `ErrorModel.gnss_s`, and
-the IMU's rates and accelerations."""
+"""Causes of standing errors: a GNSS receiver, whose errors have a memory of `ErrorModel.gnss_s`, and the
+IMU's rates and accelerations."""
 
 _SPEED_M_S = 30.0
-"""Speeds that are likely at first (sigma): a car's."""
+"""Prior sigma of the speed: a car's."""
 
-_MOST_MISSES = 10
-"""Fixes in a row that are left out before the trajectory starts anew: so many are not outliers. Of a young
-one, no more than it has taken: an outlier among its first fixes points it elsewhere."""
+_MOST_REJECTED = 10
+"""Fixes in a row that are rejected before the trajectory starts anew: so many are not outliers. In a young
+one, no more than it has accepted: an outlier among its first fixes points it elsewhere."""
 
 _MOTION = 6
 _SLOW = slice(6, 9)
 _FIXED = 9
-"""Position, velocity, and what changes slowly; the standing causes follow."""
+"""Columns of position and velocity, of slow errors, and the first of standing errors."""
 
-_KEPT_US = 10e6
-"""Time out of sight after which a bar's errors are no state any more: most bars never come back."""
+_MEMORY_US = 10e6
+"""Time out of sight after which a bar's errors are dropped: most bars never come back."""
 
 _COURSE_S = 0.3
-"""Memory of the course of fixes: acceleration of 3 m/s2 takes it a quarter of a metre off."""
+"""Memory of the course of fixes: an acceleration of 3 m/s2 takes it a quarter of a metre off."""
 
-_FORESEEN = 3
-"""Fixes from which on the course foresees the next one; before, it is the line through them and that one."""
+_COURSE_FIXES = 3
+"""Fixes from which on the course predicts the next one; before, it is the line through them and that one."""
 
-_AGAIN = (4, 8, 16)
-"""Fixes after which those since a course began are taken again, each where the course has it by then."""
+_REFILTER_COUNTS = (4, 8, 16)
+"""Fixes after which those since a course began are filtered again, each where the course has it by then."""
 
-_MOST_NOISE = 3.0
-"""Sigmas of its noise that a fix may be off its course; what is more is not noise."""
+_MOST_NOISE_SIGMAS = 3.0
+"""Sigmas of its noise that a fix may be off its course; more is not noise."""
 
-_SWAYED = 1e-3
-"""Share of a fix's noise, as variance, by which what one sigma of each error that stays does to it may change
-with the noise: so much information each fix adds where there is none; a bar is seen for some hundred."""
+_NOISY_SHARE = 1e-3
+"""Share of a fix's noise, as variance, by which its shifts by one sigma of each standing error may change
+with the noise: each fix adds so much false information; a bar is seen for some hundred."""
 
 _TURN_US = 1e6
-"""Longest time between fixes over which the way turns as the camera did."""
+"""Longest time between fixes over which the trajectory turns with the camera's headings."""
 
 
 @dataclass(frozen=True)
 class Cause:
-    """So many standing errors of one part, that are states of a trajectory.
+    """Standing errors of one part, `size` of them, as states of a trajectory.
 
     The name is as in `Fix.standing`: `camera`, `attitude`, `bar N`; the time is of the last fix that they
     entered.
@@ -221,9 +221,9 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Where fixes of some bars go on to, errors that stay included: a line through the last `count` of them.
+    """Where fixes of some bars lead, standing errors included: a line through the last `count` of them.
 
-    Place and speed, east, north, up, float64 (3,), are those at the last of them.
+    Place and speed, east, north, up, float64 (3,), are at the last of them.
     """
 
     place_m: Floats
@@ -234,23 +234,21 @@ class Course:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryPoint:
-    """Position and velocity at one time, filtered or smoothed, with what stays wrong; the filter's state,
-    too.
+    """Position and velocity at one time, filtered or smoothed, with standing errors; the filter's state, too.
 
     Attributes:
         t_us: Camera clock, us.
         mean: East, north, up, m, their velocities, m/s, three slow errors, and the standing ones of all
             `causes` in a row, in their own sigmas, float64 (n,).
         covariance: Of these, float64 (n, n).
-        causes: What the standing errors are of.
-        heading_deg: Of the camera, as a fix or the IMU said last; when and how surely: `heading_t_us`,
-            `heading_sigma_deg`.
-        motion: How the camera turned from the point before to this one.
-        misses: Fixes in a row that were left out, this one included; 0 where it counts.
+        causes: Of the standing errors.
+        heading_deg: The camera's, by the last fix or the IMU, of `heading_t_us`, with `heading_sigma_deg`.
+        motion: The camera's motion since the point before.
+        rejected: Fixes in a row that were rejected, up to this one; 0 where it counts.
         starts: A trajectory starts here.
-        taken: Fixes that count since then, this one included, as far as that matters.
-        fix: What was taken, or left out.
-        course: How the fixes of the same bars go on, with little of their noise.
+        accepted: Fixes that count since then, up to this one, as far as that matters.
+        fix: The fix, accepted or rejected.
+        course: The course of fixes of the same bars, with little of their noise.
         recent: The points from the one before that course on, as long as it is short.
     """
 
@@ -262,9 +260,9 @@ class TrajectoryPoint:
     heading_t_us: float = -math.inf
     heading_sigma_deg: float = 0.0
     motion: ImuMotion | None = None
-    misses: int = 0
+    rejected: int = 0
     starts: bool = False
-    taken: int = 1
+    accepted: int = 1
     fix: Fix | None = None
     course: Course | None = None
     recent: tuple["TrajectoryPoint", ...] = ()
@@ -275,157 +273,159 @@ class TrajectoryPoint:
         return self.covariance[:3, :3]
 
     def standing(self, name: str) -> tuple[Floats, Floats] | None:
-        """What is estimated of a part's standing errors, in their sigmas, (k,), and its covariance, (k, k).
+        """Estimates of a part's standing errors, in their sigmas, (k,), and their covariance, (k, k).
 
         None where it has none. An error that nothing has shown is 0 with a covariance of 1.
         """
-        for cause, at in _columns(self.causes):
+        for cause, columns in _cause_columns(self.causes):
             if cause.name == name:
-                return self.mean[at], self.covariance[at, at]
+                return self.mean[columns], self.covariance[columns, columns]
         return None
 
 
-def _columns(causes: Iterable[Cause]) -> list[tuple[Cause, slice]]:
-    found, at = [], _FIXED
+def _cause_columns(causes: Iterable[Cause]) -> list[tuple[Cause, slice]]:
+    columns, first = [], _FIXED
     for cause in causes:
-        found.append((cause, slice(at, at + cause.size)))
-        at += cause.size
-    return found
+        columns.append((cause, slice(first, first + cause.size)))
+        first += cause.size
+    return columns
 
 
-def trajectory_step(
+def step_trajectory(
     state: TrajectoryPoint | None, fix: Fix, spec: ErrorModel, imu: MotionSource | None = None
 ) -> TrajectoryPoint:
-    """Take a fix: velocity that turns as the camera does, driven by white acceleration (Bar-Shalom, chapter
-    6), or that changes as an accelerometer says.
+    """Filter a fix: velocity turns with the camera, driven by white acceleration (Bar-Shalom, chapter 6), or
+    changes as an accelerometer measures.
 
-    A fix beyond `spec.gate_sigmas`, one of GNSS that fails its test at `spec.false_alarm`, is left out, and
-    after many of those in a row the trajectory starts anew. The fix is a given one, not before the last; the
-    state, None at the start, is not changed. Where no IMU says how the camera turns, the fixes' headings do.
+    A fix beyond `spec.gate_sigmas`, or one of GNSS that fails its test at `spec.false_alarm`, is rejected;
+    after many in a row the trajectory starts anew. The fix is a given one, not before the last; the state,
+    None at the start, is not changed. Without an IMU's motion, the fixes' headings show how the camera turns.
     """
     if state is None:
-        return _first(fix)
+        return _start_trajectory(fix)
     motion = imu(state.t_us, fix.t_us) if imu is not None and fix.t_us > state.t_us else None
     if motion is None:
-        # As the camera's headings do, if they are known.
         turn = math.remainder(fix.heading_deg - state.heading_deg, 360.0)
         recent = fix.t_us - state.heading_t_us <= _TURN_US
         turn_rad = math.radians(turn) if recent and math.isfinite(turn) else 0.0
         motion = ImuMotion.from_uniform_turn((fix.t_us - state.t_us) * 1e-6, turn_rad)
-    ahead, seen = _expected(_joined(_ahead(state, fix.t_us, motion, spec), fix), fix)
-    innovation = fix.enu_m - seen @ ahead.mean
-    spread = seen @ ahead.covariance @ seen.T + fix.noise_m2
+    predicted = _add_fix_causes(_predict(state, fix.t_us, motion, spec), fix)
+    predicted, observation = _observe_on_course(predicted, fix)
+    innovation = fix.enu_m - observation @ predicted.mean
+    spread = observation @ predicted.covariance @ observation.T + fix.noise_m2
     limit = chi_square(spec.false_alarm, 3) if fix.source == GNSS else spec.gate_sigmas**2
     if innovation @ np.linalg.solve(spread, innovation) > limit:
-        if state.misses + 1 > min(_MOST_MISSES, state.taken):
-            return _first(fix)
-        return _caught_up(state, replace(_faced(ahead, fix), misses=state.misses + 1), spec)
-    return _caught_up(state, _taken(ahead, fix, seen), spec)
+        if state.rejected + 1 > min(_MOST_REJECTED, state.accepted):
+            return _start_trajectory(fix)
+        return _refine_course(state, replace(_set_heading(predicted, fix), rejected=state.rejected + 1), spec)
+    return _refine_course(state, _apply_fix(predicted, fix, observation), spec)
 
 
-def _caught_up(state: TrajectoryPoint, point: TrajectoryPoint, spec: ErrorModel) -> TrajectoryPoint:
-    """A point after a state; when a course is young, and known better, its fixes are taken again."""
+def _refine_course(state: TrajectoryPoint, point: TrajectoryPoint, spec: ErrorModel) -> TrajectoryPoint:
+    """Filter the fixes of a young course again, now that it is known better; return the point so."""
     course = point.course
-    if course is None or course.count > _AGAIN[-1] or point.fix is None:
+    if course is None or course.count > _REFILTER_COUNTS[-1] or point.fix is None:
         return point
     before = replace(state, recent=())
     recent = (*state.recent, before) if course.count > 1 else (before,)
-    if course is not state.course and course.count in _AGAIN and _swayed(point.fix):
+    if course is not state.course and course.count in _REFILTER_COUNTS and _has_noisy_standing(point.fix):
         points = [*recent, point]
-        *recent_again, point = _again(points, _smoothed(points, spec), spec)
-        recent = tuple(recent_again)
-    return replace(point, recent=recent if course.count < _AGAIN[-1] else ())
+        *refiltered, point = _refilter(points, _smooth_once(points, spec), spec)
+        recent = tuple(refiltered)
+    return replace(point, recent=recent if course.count < _REFILTER_COUNTS[-1] else ())
 
 
-def _taken(ahead: TrajectoryPoint, fix: Fix, seen: Floats) -> TrajectoryPoint:
-    """A point with a fix taken that depends on the states so, float64 (3, n)."""
-    known = ahead.covariance @ seen.T
-    spread = seen @ known + fix.noise_m2
-    gain = np.linalg.solve(spread, known.T).T
+def _apply_fix(predicted: TrajectoryPoint, fix: Fix, observation: Floats) -> TrajectoryPoint:
+    """Kalman update with a fix, whose observation matrix is float64 (3, n)."""
+    crossed = predicted.covariance @ observation.T
+    spread = observation @ crossed + fix.noise_m2
+    gain = np.linalg.solve(spread, crossed.T).T
     # Joseph's form keeps the covariance positive.
-    change = gain @ known.T
-    after = ahead.covariance - change - change.T + gain @ spread @ gain.T
-    mean = ahead.mean + gain @ (fix.enu_m - seen @ ahead.mean)
+    change = gain @ crossed.T
+    after = predicted.covariance - change - change.T + gain @ spread @ gain.T
+    mean = predicted.mean + gain @ (fix.enu_m - observation @ predicted.mean)
     after = (after + after.T) / 2
-    taken = min(ahead.taken + 1, _MOST_MISSES)
-    return replace(_faced(ahead, fix), mean=mean, covariance=after, misses=0, taken=taken)
+    accepted = min(predicted.accepted + 1, _MOST_REJECTED)
+    return replace(_set_heading(predicted, fix), mean=mean, covariance=after, rejected=0, accepted=accepted)
 
 
 def filter_fixes(
     fixes: Iterable[Fix], spec: ErrorModel, imu: MotionSource | None = None
 ) -> list[TrajectoryPoint]:
-    """Filter the fixes that are given, one point each; refused ones have none."""
+    """Filter the given fixes, one point each; refused ones have none."""
     points: list[TrajectoryPoint] = []
     for fix in fixes:
         if not fix.refusal:
-            points.append(trajectory_step(points[-1] if points else None, fix, spec, imu))
+            points.append(step_trajectory(points[-1] if points else None, fix, spec, imu))
     return points
 
 
 def smooth_trajectory(points: Sequence[TrajectoryPoint], spec: ErrorModel) -> list[TrajectoryPoint]:
-    """Smooth filtered points with those after them (Rauch, Tung, Striebel 1965), each trajectory alone.
+    """Smooth filtered points with later ones (Rauch, Tung, Striebel 1965), each trajectory by itself.
 
-    Where noise of the fixes changes how errors that stay move them, they are filtered and smoothed once more,
-    each as it is where the smoothed track has it: the iterated smoother (Bell, SIAM J. Optim. 4 (1994), 626).
+    Where a fix's noise changes its shifts by standing errors, all are filtered and smoothed once more, each
+    where the smoothed track has it: the iterated smoother (Bell, SIAM J. Optim. 4 (1994), 626).
     """
-    smoothed = _smoothed(points, spec)
-    if not any(point.fix is not None and _swayed(point.fix) for point in points):
+    smoothed = _smooth_once(points, spec)
+    if not any(point.fix is not None and _has_noisy_standing(point.fix) for point in points):
         return smoothed
-    return _smoothed(_again(points, smoothed, spec), spec)
+    return _smooth_once(_refilter(points, smoothed, spec), spec)
 
 
-def _again(
+def _refilter(
     points: Sequence[TrajectoryPoint], smoothed: Sequence[TrajectoryPoint], spec: ErrorModel
 ) -> list[TrajectoryPoint]:
-    """Filter points again, each fix as it is where the smoothed track has it; the first one, where no
-    trajectory starts, stays.
+    """Filter points again, with observation matrices where the smoothed track has the fixes; the first point
+    stays unless a trajectory starts there.
     """
-    again = list(points)
-    for i, (point, there) in enumerate(zip(points, smoothed, strict=True)):
-        if point.fix is None:
+    refiltered = list(points)
+    for i, (point, smooth) in enumerate(zip(points, smoothed, strict=True)):
+        fix = point.fix
+        if fix is None:
             continue
-        # What changes slowly is noise.
-        still = np.where(np.arange(len(there.mean)) // 3 == _SLOW.start // 3, 0.0, there.mean)
-        away = point.fix.enu_m - _seen(there.causes, point.fix) @ still
+        # Slow errors count as noise.
+        mean = np.where(np.arange(len(smooth.mean)) // 3 == _SLOW.start // 3, 0.0, smooth.mean)
+        shifted = _shift_standing(fix, fix.enu_m - _observation_matrix(smooth.causes, fix) @ mean)
         if point.starts:
-            again[i] = replace(_first(_moved(point.fix, away)), fix=point.fix)
+            refiltered[i] = replace(_start_trajectory(shifted), fix=fix)
         elif i:
             assert point.motion is not None
-            ahead = _joined(_ahead(again[i - 1], point.t_us, point.motion, spec), point.fix)
-            seen = _seen(ahead.causes, _moved(point.fix, away))
-            taken = _faced(ahead, point.fix) if point.misses else _taken(ahead, point.fix, seen)
-            again[i] = replace(taken, misses=point.misses, course=point.course, taken=point.taken)
-    return again
+            new = _add_fix_causes(_predict(refiltered[i - 1], point.t_us, point.motion, spec), fix)
+            observation = _observation_matrix(new.causes, shifted)
+            new = _set_heading(new, fix) if point.rejected else _apply_fix(new, fix, observation)
+            refiltered[i] = replace(
+                new, rejected=point.rejected, accepted=point.accepted, course=point.course
+            )
+    return refiltered
 
 
-def _smoothed(points: Sequence[TrajectoryPoint], spec: ErrorModel) -> list[TrajectoryPoint]:
-    """One pass of the smoother."""
+def _smooth_once(points: Sequence[TrajectoryPoint], spec: ErrorModel) -> list[TrajectoryPoint]:
     smoothed = list(points)
     for i in range(len(points) - 2, -1, -1):
         if points[i + 1].starts:
             continue
         after, motion = smoothed[i + 1], points[i + 1].motion
         assert motion is not None
-        here = _biased(points[i], after.t_us, motion, spec)
-        ahead, move, noise, causes, _ = _motion(here, after.t_us, motion, spec)
-        # Causes that came later are independent of this point: what is common has passed on.
-        at = {cause.name: columns for cause, columns in _columns(after.causes)}
-        common = [*range(_FIXED), *(i for c in causes for i in range(at[c.name].start, at[c.name].stop))]
-        mean = ahead[: len(common)]
-        spread = (move @ here.covariance @ move.T + noise)[: len(common), : len(common)]
-        crossed = (move @ here.covariance)[: len(common)]
+        point = _add_imu_biases(points[i], after.t_us, motion, spec)
+        predicted, transition, noise, causes, _ = _state_transition(point, after.t_us, motion, spec)
+        # Later causes are independent of this point.
+        columns = {c.name: range(at.start, at.stop) for c, at in _cause_columns(after.causes)}
+        common = [*range(_FIXED), *(i for cause in causes for i in columns[cause.name])]
+        mean = predicted[: len(common)]
+        spread = (transition @ point.covariance @ transition.T + noise)[: len(common), : len(common)]
+        crossed = (transition @ point.covariance)[: len(common)]
         gain = np.linalg.solve(spread, crossed).T
-        there = after.covariance[np.ix_(common, common)]
-        covariance = here.covariance + gain @ (there - spread) @ gain.T
-        moved = here.mean + gain @ (after.mean[common] - mean)
-        smoothed[i] = replace(here, mean=moved, covariance=(covariance + covariance.T) / 2)
+        smooth = after.covariance[np.ix_(common, common)]
+        covariance = point.covariance + gain @ (smooth - spread) @ gain.T
+        mean_after = point.mean + gain @ (after.mean[common] - mean)
+        smoothed[i] = replace(point, mean=mean_after, covariance=(covariance + covariance.T) / 2)
     return smoothed
 
 
-def heading_at(
+def predict_heading(
     point: TrajectoryPoint, t_us: float, imu: MotionSource | None = None
 ) -> tuple[float, float] | None:
-    """The camera's heading at a time not before a point, and its sigma, degrees; None if not known."""
+    """The camera's heading at a time not before a point, and its sigma, degrees; None if it is unknown."""
     if not math.isfinite(point.heading_deg):
         return None
     motion = imu(point.heading_t_us, t_us) if imu is not None and t_us > point.heading_t_us else None
@@ -435,98 +435,98 @@ def heading_at(
     return (point.heading_deg, point.heading_sigma_deg) if recent else None
 
 
-def _first(fix: Fix) -> TrajectoryPoint:
-    """A trajectory that starts at a fix: its position is off by what stays as the fix is."""
+def _start_trajectory(fix: Fix) -> TrajectoryPoint:
+    """Start a trajectory at a fix, with the errors of its position correlated with the standing ones."""
     causes = tuple(Cause(name, moves.shape[1], fix.t_us) for name, moves in fix.standing.items())
     size = _FIXED + sum(cause.size for cause in causes)
     covariance = np.eye(size)
     covariance[3:_MOTION, 3:_MOTION] *= _SPEED_M_S**2
-    moves = _seen(causes, fix)[:, _MOTION:]
+    moves = _observation_matrix(causes, fix)[:, _MOTION:]
     covariance[:3, :3] = fix.noise_m2 + moves @ moves.T
     covariance[:3, _MOTION:] = -moves
     covariance[_MOTION:, :3] = -moves.T
     mean = np.concatenate([fix.enu_m, np.zeros(size - 3)])
-    first = TrajectoryPoint(fix.t_us, mean, covariance, causes, starts=True, course=_course(fix))
-    return _faced(first, fix)
+    point = TrajectoryPoint(fix.t_us, mean, covariance, causes, starts=True, course=_start_course(fix))
+    return _set_heading(point, fix)
 
 
-def _seen(causes: Sequence[Cause], fix: Fix) -> Floats:
-    """How a fix depends on the states, float64 (3, n)."""
-    seen = np.zeros((3, _FIXED + sum(cause.size for cause in causes)))
-    seen[:, :3] = np.eye(3)
-    seen[:, _SLOW] = symmetric_root(fix.slow_m2)
-    for cause, at in _columns(causes):
+def _observation_matrix(causes: Sequence[Cause], fix: Fix) -> Floats:
+    """Slopes of a fix by the states, float64 (3, n)."""
+    observation = np.zeros((3, _FIXED + sum(cause.size for cause in causes)))
+    observation[:, :3] = np.eye(3)
+    observation[:, _SLOW] = symmetric_root(fix.slow_m2)
+    for cause, columns in _cause_columns(causes):
         if cause.name in fix.standing:
-            seen[:, at] = fix.standing[cause.name]
-    return seen
+            observation[:, columns] = fix.standing[cause.name]
+    return observation
 
 
-def _expected(ahead: TrajectoryPoint, fix: Fix) -> tuple[TrajectoryPoint, Floats]:
-    """How a fix depends on the states where the course of fixes has it, float64 (3, n), and that course.
+def _observe_on_course(predicted: TrajectoryPoint, fix: Fix) -> tuple[TrajectoryPoint, Floats]:
+    """Observation matrix of a fix where its course has it, float64 (3, n), and the point with that course.
 
-    Not where it is: how errors that stay move it follows its noise there, and noise would seem to show them.
-    Two or three bars of which each is surveyed to 5 cm so make a track twice too sure.
+    Not where the fix is: there, the shifts by standing errors follow the fix's noise, which would seem to
+    show them. With two or three bars, each surveyed to 5 cm, a track's sigmas would be half of the true ones.
     """
-    last = ahead.course
+    course = predicted.course
     if not fix.standing_slope:
-        return ahead, _seen(ahead.causes, fix)
-    if last is None or last.transmitters != fix.transmitters or ahead.motion is None:
-        return replace(ahead, course=_course(fix)), _seen(ahead.causes, fix)
-    dt = float(ahead.motion.t_s[-1])
-    turn = complex(*last.speed_m_s[:2]) * np.exp(-1j * float(ahead.motion.turn_rad[-1]))
-    speed = np.array([turn.real, turn.imag, last.speed_m_s[2]])
-    place = last.place_m + speed * dt
-    away, count, fade = fix.enu_m - place, last.count, math.exp(-dt / _COURSE_S)
+        return predicted, _observation_matrix(predicted.causes, fix)
+    if course is None or course.transmitters != fix.transmitters or predicted.motion is None:
+        return replace(predicted, course=_start_course(fix)), _observation_matrix(predicted.causes, fix)
+    dt_s = float(predicted.motion.t_s[-1])
+    horizontal = complex(*course.speed_m_s[:2]) * np.exp(-1j * float(predicted.motion.turn_rad[-1]))
+    speed_m_s = np.array([horizontal.real, horizontal.imag, course.speed_m_s[2]])
+    place_m = course.place_m + speed_m_s * dt_s
+    offset_m, count, fade = fix.enu_m - place_m, course.count, math.exp(-dt_s / _COURSE_S)
     # Of the line through all of so many fixes, until older ones count less: Brookner, Tracking, 1998, 1.2.10.
     by_place = max(2 * (2 * count + 1) / ((count + 1) * (count + 2)), 1 - fade**2)
     by_speed = max(6 / ((count + 1) * (count + 2)), (1 - fade) ** 2)
-    place, speed = place + by_place * away, speed + by_speed * away / max(dt, 1e-6)
-    course = Course(place, speed, count + 1, fix.transmitters)
-    if count < _FORESEEN:
-        away = fix.enu_m - course.place_m
-    sigmas = math.sqrt(float(away @ np.linalg.solve(fix.noise_m2 + fix.slow_m2, away)))
-    away = away * min(1.0, _MOST_NOISE / max(sigmas, 1e-9))
-    return replace(ahead, course=course), _seen(ahead.causes, _moved(fix, away))
+    place_m, speed_m_s = place_m + by_place * offset_m, speed_m_s + by_speed * offset_m / max(dt_s, 1e-6)
+    course = Course(place_m, speed_m_s, count + 1, fix.transmitters)
+    if count < _COURSE_FIXES:
+        offset_m = fix.enu_m - course.place_m
+    sigmas = math.sqrt(float(offset_m @ np.linalg.solve(fix.noise_m2 + fix.slow_m2, offset_m)))
+    offset_m = offset_m * min(1.0, _MOST_NOISE_SIGMAS / max(sigmas, 1e-9))
+    observation = _observation_matrix(predicted.causes, _shift_standing(fix, offset_m))
+    return replace(predicted, course=course), observation
 
 
-def _course(fix: Fix) -> Course:
-    """A course that begins."""
+def _start_course(fix: Fix) -> Course:
     return Course(fix.enu_m, np.zeros(3), 1, fix.transmitters)
 
 
-def _moved(fix: Fix, away_m: Floats) -> Fix:
-    """A fix with what errors that stay do to it where its noise is less by so much, float64 (3,)."""
-    along_m, slopes = float(fix.weakest_axis @ away_m), fix.standing_slope
-    moves = {n: m - along_m * slopes[n] if n in slopes else m for n, m in fix.standing.items()}
-    return replace(fix, standing=moves)
+def _shift_standing(fix: Fix, offset_m: Floats) -> Fix:
+    """A fix with the standing moves that it has at a place shifted against its noise, m, float64 (3,)."""
+    along_m = float(fix.weakest_axis @ offset_m)
+    changes = {n: fix.standing[n] - along_m * slope for n, slope in fix.standing_slope.items()}
+    return replace(fix, standing={**fix.standing, **changes})
 
 
-def _swayed(fix: Fix) -> bool:
-    """Whether its noise changes what errors that stay do to it by as much as matters in a hundred fixes."""
+def _has_noisy_standing(fix: Fix) -> bool:
+    """Whether a fix's noise changes its standing moves by an amount that matters in a hundred fixes."""
     noise = fix.noise_m2 + fix.slow_m2
-    change = float(fix.weakest_axis @ noise @ fix.weakest_axis) * sum(
-        [(s * s).sum() for s in fix.standing_slope.values()]
-    )
-    return bool(change > _SWAYED * np.trace(noise))
+    variance = float(fix.weakest_axis @ noise @ fix.weakest_axis)
+    change = variance * sum([(s * s).sum() for s in fix.standing_slope.values()])
+    return bool(change > _NOISY_SHARE * np.trace(noise))
 
 
-def _joined(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
-    """A point with the fix's causes among its own."""
+def _add_fix_causes(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
     causes = [replace(c, t_us=fix.t_us) if c.name in fix.standing else c for c in point.causes]
     known = {cause.name for cause in causes}
     new = [Cause(n, moves.shape[1], fix.t_us) for n, moves in fix.standing.items() if n not in known]
-    return _widened(replace(point, causes=tuple(causes)), new)
+    return _add_causes(replace(point, causes=tuple(causes)), new)
 
 
-def _biased(point: TrajectoryPoint, t_us: float, motion: ImuMotion, spec: ErrorModel) -> TrajectoryPoint:
-    """A point with the biases of the IMU that lead to the next one, which nothing may have shown before."""
+def _add_imu_biases(
+    point: TrajectoryPoint, t_us: float, motion: ImuMotion, spec: ErrorModel
+) -> TrajectoryPoint:
+    """Add the biases of the IMU, of which nothing may be known before."""
     biases = len(imu_sigmas(motion, spec))
     known = not biases or any(cause.name == IMU for cause in point.causes)
-    return point if known else _widened(point, [Cause(IMU, biases, t_us)])
+    return point if known else _add_causes(point, [Cause(IMU, biases, t_us)])
 
 
-def _widened(point: TrajectoryPoint, new: Sequence[Cause]) -> TrajectoryPoint:
-    """A point with further causes, of which nothing is known but their sigmas."""
+def _add_causes(point: TrajectoryPoint, new: Sequence[Cause]) -> TrajectoryPoint:
+    """Add causes, of which only their sigmas are known."""
     more, size = sum(cause.size for cause in new), len(point.mean)
     covariance = np.eye(size + more)
     covariance[:size, :size] = point.covariance
@@ -534,26 +534,26 @@ def _widened(point: TrajectoryPoint, new: Sequence[Cause]) -> TrajectoryPoint:
     return replace(point, mean=mean, covariance=covariance, causes=(*point.causes, *new))
 
 
-def _ahead(point: TrajectoryPoint, t_us: float, motion: ImuMotion, spec: ErrorModel) -> TrajectoryPoint:
-    point = _biased(point, t_us, motion, spec)
-    mean, move, noise, causes, turn_rad = _motion(point, t_us, motion, spec)
-    covariance = move @ point.covariance @ move.T + noise
-    ahead = replace(
+def _predict(point: TrajectoryPoint, t_us: float, motion: ImuMotion, spec: ErrorModel) -> TrajectoryPoint:
+    point = _add_imu_biases(point, t_us, motion, spec)
+    mean, transition, noise, causes, turn_rad = _state_transition(point, t_us, motion, spec)
+    covariance = transition @ point.covariance @ transition.T + noise
+    predicted = replace(
         point, t_us=t_us, mean=mean, covariance=covariance, causes=causes, motion=motion, starts=False
     )
     if not motion.has_gyro:
-        return ahead
+        return predicted
     drift_deg = spec.rate_white_deg_rts * math.sqrt(float(motion.t_s[-1]))
     return replace(
-        ahead,
+        predicted,
         heading_deg=point.heading_deg + math.degrees(turn_rad),
         heading_t_us=t_us,
         heading_sigma_deg=math.hypot(point.heading_sigma_deg, drift_deg),
     )
 
 
-def _faced(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
-    """A point at a fix, with its heading if it has one."""
+def _set_heading(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
+    """Set a point's fix, and its heading if the fix has one."""
     if not math.isfinite(fix.heading_deg):
         return replace(point, fix=fix)
     sigma_deg = fix.heading_sigma_deg if math.isfinite(fix.heading_sigma_deg) else 0.0
@@ -562,38 +562,37 @@ def _faced(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
     )
 
 
-def _motion(
+def _state_transition(
     point: TrajectoryPoint, t_us: float, motion: ImuMotion, spec: ErrorModel
 ) -> tuple[Floats, Floats, Floats, tuple[Cause, ...], float]:
-    """A point at a later time, (m,), how it depends on it, (m, n), what is new, (m, m), causes, the turn."""
-    dt = (t_us - point.t_us) * 1e-6
-    # Of what passes by, most never comes back.
-    late = [c for c in point.causes if t_us - c.t_us > _KEPT_US]
-    passed = {c.name for c in late if c.name.startswith("bar ") or c.name == "doubt"}
-    kept = [(c, at) for c, at in _columns(point.causes) if c.name not in passed]
-    rows = [*range(_FIXED), *(i for _, at in kept for i in range(at.start, at.stop))]
-    move = np.eye(len(point.mean))[rows]
+    """Mean at a later time, (m,), transition, (m, n), added covariance, (m, m), causes, and the turn."""
+    dt_s = (t_us - point.t_us) * 1e-6
+    outdated = [c for c in point.causes if t_us - c.t_us > _MEMORY_US]
+    dropped = {c.name for c in outdated if c.name.startswith("bar ") or c.name == "attitude-excess"}
+    kept = [(c, columns) for c, columns in _cause_columns(point.causes) if c.name not in dropped]
+    rows = [*range(_FIXED), *(i for _, columns in kept for i in range(columns.start, columns.stop))]
+    transition = np.eye(len(point.mean))[rows]
     noise = np.zeros((len(rows), len(rows)))
-    own = next((at for c, at in _columns(point.causes) if c.name == IMU), slice(0, 0))
+    imu_columns = next((columns for c, columns in _cause_columns(point.causes) if c.name == IMU), slice(0, 0))
     if motion.acceleration_m_s2 is not None and not math.isfinite(point.heading_deg):
-        # Where a push points to is not known without a heading.
+        # An acceleration has no direction without a heading.
         motion = replace(motion, acceleration_m_s2=None)
-    imu = point.mean[own][: len(imu_sigmas(motion, spec))]
+    biases = point.mean[imu_columns][: len(imu_sigmas(motion, spec))]
     heading_rad, sigma_rad = math.radians(point.heading_deg), math.radians(point.heading_sigma_deg)
-    way = reckon(motion, point.mean[3:_MOTION], heading_rad, sigma_rad, imu, spec)
-    move[:_MOTION, :_MOTION] = way.move
-    noise[:_MOTION, :_MOTION] = way.noise
-    fade = math.exp(-dt / spec.slow_s)
-    move[_SLOW] *= fade
+    reckoned = dead_reckon(motion, point.mean[3:_MOTION], heading_rad, sigma_rad, biases, spec)
+    transition[:_MOTION, :_MOTION] = reckoned.transition
+    noise[:_MOTION, :_MOTION] = reckoned.noise
+    fade = math.exp(-dt_s / spec.slow_s)
+    transition[_SLOW] *= fade
     noise[_SLOW, _SLOW] = (1 - fade**2) * np.eye(3)
     causes = [cause for cause, _ in kept]
-    for cause, at in _columns(causes):
+    for cause, columns in _cause_columns(causes):
         if cause.name == GNSS:
-            fade = math.exp(-dt / spec.gnss_s)
-            move[at] *= fade
-            noise[at, at] = (1 - fade**2) * np.eye(cause.size)
-    mean = move @ point.mean
-    mean[:_MOTION] += way.added
-    # The mean has them already, the move by them is what is left.
-    move[:_MOTION, own.start : own.start + len(imu)] = way.by_imu
-    return mean, move, noise, tuple(causes), way.turn_rad
+            fade = math.exp(-dt_s / spec.gnss_s)
+            transition[columns] *= fade
+            noise[columns, columns] = (1 - fade**2) * np.eye(cause.size)
+    mean = transition @ point.mean
+    mean[:_MOTION] += reckoned.displacement
+    # The mean has the biases already; what is left is their effect on the covariance.
+    transition[:_MOTION, imu_columns.start : imu_columns.start + len(biases)] = reckoned.by_bias
+    return mean, transition, noise, tuple(causes), reckoned.turn_rad

@@ -51,7 +51,7 @@ class GeoJson(Sink):
     def finish(self) -> Mapping[str, Any]:
         """Write the bars, and end the file."""
         assert self.run.navigator is not None
-        for number, site in self.run.navigator.positioner.bars.stands_at.items():
+        for number, site in self.run.navigator.positioner.bars.known_sites.items():
             self._write_feature(
                 "Point",
                 [site.longitude_deg, site.latitude_deg, site.height_m],

@@ -8,7 +8,7 @@ from evlcp_sdk.files import escape_formula
 from evlcp_sdk.formatting import format_or_empty
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.navigator import Place, Settled
-from evlcp_sdk.place.points import bar_point
+from evlcp_sdk.place.points import locate_bar
 from evlcp_sdk.results.columns import PLACE_COLUMNS, place_row
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
@@ -127,7 +127,7 @@ class PointsCsv(_Table):
         for frame in packet.frames:
             point = None
             if frame.echo_of is None:
-                point = bar_point(frame, link.bar.length_m, link.camera, link.camera_sigma, errors)
+                point = locate_bar(frame, link.bar.length_m, link.camera, link.camera_sigma, errors)
             if point is not None:
                 self._rows.writerow(
                     [

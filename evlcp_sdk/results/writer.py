@@ -108,7 +108,7 @@ class ResultWriter:
         """Take the receiver's next events."""
         self._readout.add(events)
         if self._navigator is not None and len(events):
-            self._navigator.note_span(int(events.t_us[0]), int(events.t_us[-1]))
+            self._navigator.extend_span(int(events.t_us[0]), int(events.t_us[-1]))
         self._sinks.events(events)
 
     def write(self, packets: Iterable[Packet]) -> None:

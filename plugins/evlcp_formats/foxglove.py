@@ -171,7 +171,7 @@ class Mcap(Sink):
         """Write the bars whose places have become known, or changed."""
         assert self.run.navigator is not None
         positioner = self.run.navigator.positioner
-        axes, bars = positioner.axes, dict(positioner.bars.stands_at)
+        axes, bars = positioner.axes, dict(positioner.bars.known_sites)
         if axes is None or bars == self._bars:
             return
         message = _schema("SceneUpdate")()

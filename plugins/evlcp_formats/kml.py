@@ -61,7 +61,7 @@ class Kml(Sink):
     def finish(self) -> Mapping[str, Any]:
         """Write the bars, and end the file."""
         assert self.run.navigator is not None
-        for number, site in self.run.navigator.positioner.bars.stands_at.items():
+        for number, site in self.run.navigator.positioner.bars.known_sites.items():
             where = _point(site.longitude_deg, site.latitude_deg, site.height_m)
             self._placemark(f"<name>bar {number}, id {site.transmitter_id}</name>{where}")
         self._file.write("</Document></kml>\n")

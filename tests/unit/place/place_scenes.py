@@ -15,7 +15,7 @@ from evlcp_sdk.values import Fix, Frame, Range, SoftSymbols
 Floats = NDArray[np.float64]
 
 POINTS_ONLY = ErrorModel(
-    shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0
+    vibration_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0
 )
 """Points err, each by itself, and nothing else does."""
 

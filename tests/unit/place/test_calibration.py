@@ -11,7 +11,13 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.place.calibration import Calibrated, CalibrationView, _turn_slope, calibrate, read_poses
+from evlcp_sdk.place.calibration import (
+    CalibrationResult,
+    CalibrationView,
+    _turn_slope,
+    fit_camera,
+    read_poses,
+)
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel
@@ -43,7 +49,7 @@ def views(rng, count, known, noise_px=0.1, bars=6) -> list[CalibrationView]:
     return found
 
 
-def squares_of(found: Calibrated) -> list[float]:
+def squares_of(found: CalibrationResult) -> list[float]:
     """Errors of what was determined, squared in their sigmas."""
     return [((getattr(found.camera, n) - getattr(TRUE, n)) / s) ** 2 for n, s in found.sigma.items()]
 
@@ -53,9 +59,9 @@ def test_the_camera_comes_back_within_its_sigmas(known: bool) -> None:
     rng = np.random.default_rng(6)
     squares = []
     for _ in range(4):
-        found = calibrate(views(rng, 12, known), NOMINAL, POINTS_ONLY)
+        found = fit_camera(views(rng, 12, known), NOMINAL, POINTS_ONLY)
         assert set(found.sigma) >= {"focal_mm", "k1"}
-        assert set(found.sigma) | set(found.refused) == set(CAMERA_PARAMETERS)
+        assert set(found.sigma) | set(found.undetermined_px) == set(CAMERA_PARAMETERS)
         if known:
             assert set(found.sigma) >= {"centre_x_px", "centre_y_px", "p1", "p2"}
         assert 0.7 < found.misfit < 1.3
@@ -81,8 +87,8 @@ def test_sites_that_are_not_exact_are_in_the_covariance() -> None:
                 moved = survey[0] * z[:3] + np.cross(survey[1] * z[3:6], arm) + survey[2] * z[6] * arm
                 bars.append(dataclasses.replace(one, enu_m=one.enu_m + moved, survey=survey))
             reports.append(dataclasses.replace(view, bars=tuple(bars)))
-        found = calibrate(reports, NOMINAL, POINTS_ONLY)
-        exact = calibrate(seen, NOMINAL, POINTS_ONLY)
+        found = fit_camera(reports, NOMINAL, POINTS_ONLY)
+        exact = fit_camera(seen, NOMINAL, POINTS_ONLY)
         spreads.append(found.sigma["focal_mm"] / exact.sigma["focal_mm"])
         squares += squares_of(found)
         # The whole covariance, as a link has it.
@@ -105,18 +111,18 @@ def test_what_one_bar_does_not_determine_is_refused() -> None:
         points, _ = project_bars(pole, place, rotation, NOMINAL)
         view = BarView(0, pole, points + rng.normal(0, 0.02, points.shape), np.full(16, 0.02))
         seen.append(CalibrationView((view,), place, 0.002, None, 0.1))
-    found = calibrate(seen, dataclasses.replace(NOMINAL, focal_mm=8.3), POINTS_ONLY)
+    found = fit_camera(seen, dataclasses.replace(NOMINAL, focal_mm=8.3), POINTS_ONLY)
     assert "focal_mm" in found.sigma
     assert not {"centre_x_px", "centre_y_px", "p1", "p2"} & set(found.sigma)
     assert abs(found.camera.focal_mm - 8.0) < 5 * found.sigma["focal_mm"]
     assert found.camera.centre_x_px is None
     assert found.camera.p1 == 0
-    assert set(found.refused) == set(CAMERA_PARAMETERS) - set(found.sigma)
+    assert set(found.undetermined_px) == set(CAMERA_PARAMETERS) - set(found.sigma)
     blurred = [dataclasses.replace(v, position_sigma_m=5.0) for v in seen]
     with pytest.raises(ConfigError, match="do not determine the focal length"):
-        calibrate(blurred, NOMINAL, POINTS_ONLY)
+        fit_camera(blurred, NOMINAL, POINTS_ONLY)
     with pytest.raises(ConfigError, match="nothing to calibrate from"):
-        calibrate([dataclasses.replace(seen[0], bars=())], NOMINAL, POINTS_ONLY)
+        fit_camera([dataclasses.replace(seen[0], bars=())], NOMINAL, POINTS_ONLY)
 
 
 def test_a_pose_that_is_not_right_is_reported_and_not_the_lens() -> None:
@@ -125,8 +131,8 @@ def test_a_pose_that_is_not_right_is_reported_and_not_the_lens() -> None:
     wrong = dataclasses.replace(seen[2], enu_m=seen[2].enu_m + np.array([0.5, 0, 0]))
     away = [dataclasses.replace(v, enu_m=v.enu_m + np.array([0, 111e3, 0])) for v in seen[:4]]
     for row in ([*seen[:2], wrong, *seen[3:]], away):
-        with pytest.raises(ConfigError, match="not as was said"):
-            calibrate(row, NOMINAL, POINTS_ONLY)
+        with pytest.raises(ConfigError, match="not as stated"):
+            fit_camera(row, NOMINAL, POINTS_ONLY)
 
 
 def test_angles_that_are_all_wrong_are_not_the_principal_point() -> None:
@@ -140,10 +146,10 @@ def test_angles_that_are_all_wrong_are_not_the_principal_point() -> None:
             points, _ = project_bars(pole, place, Attitude(4.0, 0.0, 0.0).rotation(), camera)
             bars.append(BarView(i, pole, points + rng.normal(0, 0.05, points.shape), np.full(16, 0.05)))
         seen.append(CalibrationView(tuple(bars), place, 0.01, Attitude(4.0, 0.0, 0.0).rotation(), 0.1))
-    assert calibrate(seen, camera).camera.focal_mm == pytest.approx(35.0, abs=0.2)
+    assert fit_camera(seen, camera).camera.focal_mm == pytest.approx(35.0, abs=0.2)
     level = Attitude(0.07, 0.0, 0.0).rotation()
     with pytest.raises(ConfigError, match=r"centre_y_px = [\d.-]+ would fit .*, 360 is configured and 26 "):
-        calibrate([dataclasses.replace(view, rotation=level) for view in seen], camera)
+        fit_camera([dataclasses.replace(view, rotation=level) for view in seen], camera)
 
 
 @pytest.mark.parametrize("turn", [np.array([0.2, -0.3, 0.1]), np.full(3, 1e-9)])

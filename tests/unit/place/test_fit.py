@@ -14,9 +14,15 @@ from scipy.spatial.transform import Rotation
 from scipy.special import huber
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.fit import FOCAL_UNIT, Equations, Fit, fit_pose, linearize, nearest_to_sights
-from evlcp_sdk.place.fit_assessment import Pose, _doubted, _test, assess_fit
-from evlcp_sdk.place.observations import BarView, Problem, project_bars, shared_errors, whole_clusters
+from evlcp_sdk.place.fit import FOCAL_UNIT, Equations, FitState, fit_pose, intersect_sight_lines, linearize
+from evlcp_sdk.place.fit_assessment import Pose, _attitude_excess, _test_fault, assess_fit
+from evlcp_sdk.place.observations import (
+    BarView,
+    Problem,
+    compute_shared_errors,
+    find_whole_clusters,
+    project_bars,
+)
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid, LedRing
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
@@ -48,10 +54,10 @@ def problem(rng: np.random.Generator, bars: int = 2, noise: float = 3.0) -> tupl
     return found, position, rotation
 
 
-def misses(p: Problem, at: Fit, change: Floats) -> Floats:
+def misses(p: Problem, at: FitState, change: Floats) -> Floats:
     """All misses in sigmas, written anew; change: 6 of the pose, a focal fault, 7 of the lens, 9 a bar."""
     z = at.lens + change[7:14]
-    off = LENS.root(BENT) @ z
+    off = LENS.covariance_root(BENT) @ z
     f = BENT.focal_px + off[0]
     camera = dataclasses.replace(
         BENT,
@@ -94,8 +100,8 @@ def whole_equations(p: Problem, equations: Equations) -> tuple[Floats, Floats, F
     rows = rows.reshape(-1, rows.shape[2])
     angles = np.pad(equations.angles, ((0, 0), (0, rows.shape[1] - 14)))
     prior = np.r_[np.zeros(7), np.ones(rows.shape[1] - 7)]
-    errors = np.r_[np.zeros(7), equations.at.lens, equations.at.local.ravel()]
-    side = rows.T @ equations.rows[:, :, -1].ravel() + angles.T @ equations.angles_miss - errors
+    errors = np.r_[np.zeros(7), equations.state.lens, equations.state.local.ravel()]
+    side = rows.T @ equations.rows[:, :, -1].ravel() + angles.T @ equations.angle_residuals - errors
     return rows, rows.T @ rows + angles.T @ angles + np.diag(prior), side
 
 
@@ -109,7 +115,7 @@ def test_equations_are_those_of_numerical_slopes() -> None:
     p, position, rotation = problem(rng, noise=0.8)
     # All points count in full.
     p = dataclasses.replace(p, spec=dataclasses.replace(SPEC, huber_sigmas=100.0))
-    at = Fit(position, rotation, rng.normal(0, 0.3, (2, 9)), rng.normal(0, 0.3, 7))
+    at = FitState(position, rotation, rng.normal(0, 0.3, (2, 9)), rng.normal(0, 0.3, 7))
     found = linearize(p, at)
     at_rest = misses(p, at, np.zeros(32))
     slope = -approx_fprime(np.zeros(32), lambda x: misses(p, at, x), 1e-6)
@@ -121,8 +127,8 @@ def test_equations_are_those_of_numerical_slopes() -> None:
     np.testing.assert_allclose(side / scale, slope.T @ at_rest / scale, atol=2e-3)
     # Without the bars' own, the step is that of all.
     shared = np.zeros(14)
-    shared[p.free] = np.linalg.solve(*found.normal)
-    step, free = np.append(shared, (found.moved(shared).local - at.local).ravel()), free_of(p)
+    shared[p.free] = np.linalg.solve(*found.normal_equations)
+    step, free = np.append(shared, (found.apply_step(shared).local - at.local).ravel()), free_of(p)
     most = 1e-6 * np.abs(side / scale).max()
     np.testing.assert_allclose((matrix @ step / scale)[free], (side / scale)[free], atol=most)
     assert found.cost == pytest.approx(at_rest @ at_rest, rel=1e-6)
@@ -132,7 +138,7 @@ def test_equations_are_those_of_numerical_slopes() -> None:
 
 def fit_problem(p: Problem, position: Floats, rotation: Floats) -> Equations:
     """Where the fit ends."""
-    found, settled = fit_pose(p, Fit.at(p, position, rotation))
+    found, settled = fit_pose(p, FitState.from_pose(p, position, rotation))
     assert settled
     return found
 
@@ -145,8 +151,8 @@ def test_the_fit_is_that_of_scipy() -> None:
     far[4, 6] += 4.0
     p = dataclasses.replace(p, points=far)
     found = fit_problem(p, position + np.array([0.5, -0.4, 0.2]), rotation)
-    fit = found.at
-    start = Fit.at(p, position, rotation)
+    fit = found.state
+    start = FitState.from_pose(p, position, rotation)
 
     def cost(x: Floats) -> Floats:
         all_ = misses(p, start, np.concatenate([x[:6], [0.0], x[6:]]))
@@ -178,7 +184,7 @@ def test_a_mean_shift_test_is_the_larger_fit(bound: float) -> None:
     spread = np.linalg.inv(rows.T @ rows)
     left = seen - rows @ (spread @ (rows.T @ seen))
     fault = wrong.T @ wrong, rows.T @ wrong, wrong.T @ left
-    value, freedom, added, unseen = _test(*fault, spread, bound * np.eye(3))
+    value, freedom, added, unseen = _test_fault(*fault, spread, bound * np.eye(3))
     both = np.concatenate([rows, wrong], 1)
     better = seen - both @ np.linalg.lstsq(both, seen, rcond=None)[0]
     assert freedom == 3
@@ -193,7 +199,7 @@ def test_a_mean_shift_test_is_the_larger_fit(bound: float) -> None:
     np.testing.assert_allclose(unseen, move @ noise @ move.T, atol=1e-9)
     # A part that says nothing has no test.
     nothing = np.zeros((14, 3))
-    empty = _test(nothing[:3], nothing, nothing[0], np.eye(14), nothing[:3])
+    empty = _test_fault(nothing[:3], nothing, nothing[0], np.eye(14), nothing[:3])
     assert empty[:2] == (0.0, 0)
     assert not np.any(empty[2:])
 
@@ -204,7 +210,7 @@ def test_the_nearest_point_to_lines_of_sight() -> None:
     sights = (enu - here) / np.linalg.norm(enu - here, axis=1, keepdims=True) + rng.normal(0, 1e-3, (6, 3))
     sights /= np.linalg.norm(sights, axis=1, keepdims=True)
     turns = Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.3], [0, 0, math.pi]]).as_matrix()
-    places, costs = nearest_to_sights(enu, sights, turns)
+    places, costs = intersect_sight_lines(enu, sights, turns)
     for turn, place, cost in zip(turns, places, costs, strict=True):
         lines = sights @ turn.T
         flat = np.eye(3) - lines[:, :, None] * lines[:, None]
@@ -213,7 +219,7 @@ def test_the_nearest_point_to_lines_of_sight() -> None:
         away = enu - want
         assert cost == pytest.approx(6 - ((away * lines).sum(1) / np.linalg.norm(away, axis=1)).sum())
     parallel = np.tile([[0.0, 1.0, 0.0]], (6, 1))
-    assert np.isinf(nearest_to_sights(enu, parallel, turns)[1]).all()
+    assert np.isinf(intersect_sight_lines(enu, parallel, turns)[1]).all()
 
 
 def test_clusters_that_count() -> None:
@@ -222,7 +228,7 @@ def test_clusters_that_count() -> None:
     points = np.stack([np.full(8, 100.0), 9.0 + 12 * np.arange(8)], 1)
     points[3], sigma[4], sigma[5] = np.nan, 0.0, np.inf
     points[6, 0] = 9.4
-    assert np.flatnonzero(whole_clusters(points, sigma, 1280, 720)).tolist() == [1, 2, 7]
+    assert np.flatnonzero(find_whole_clusters(points, sigma, 1280, 720)).tolist() == [1, 2, 7]
 
 
 @pytest.mark.parametrize("bars", [2, 3])
@@ -237,10 +243,10 @@ def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
     spread[np.ix_(keep, keep)] = np.linalg.inv(matrix[np.ix_(keep, keep)])
     np.testing.assert_allclose(pose.covariance, spread[:6, :6], rtol=1e-6, atol=1e-12)
     by_points = spread[:3] @ rows.T
-    slow = by_points @ np.diag(equations.stands) @ by_points.T
+    slow = by_points @ np.diag(equations.standing_share) @ by_points.T
     np.testing.assert_allclose(pose.slow, slow, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(pose.standing["camera"], -spread[:3, 7:14], rtol=1e-6, atol=1e-9)
-    angles = spread[:3, :14] @ equations.angles.T @ p.angles.white @ p.attitude.bias_root_rad()
+    angles = spread[:3, :14] @ equations.angles.T @ p.angles.whitening @ p.attitude.bias_root_rad()
     np.testing.assert_allclose(pose.standing["attitude"], angles, rtol=1e-6, atol=1e-9)
     for b in range(bars):
         own = slice(14 + 9 * b + 2, 23 + 9 * b)
@@ -270,8 +276,8 @@ def test_a_doubt_is_the_mean_over_both_hypotheses(off: float) -> None:
     away = (there - at)[:6]
     want = max(weight - rarely, 0) * (wider - spread)[:6, :6] + weight * np.outer(away, away)
     reported = SimpleNamespace(free=np.ones(14, bool))
-    equations: Any = SimpleNamespace(problem=reported, angles=angles, angles_miss=seen[30:] - angles @ at)
-    out = _doubted(equations, spread)
+    equations: Any = SimpleNamespace(problem=reported, angles=angles, angle_residuals=seen[30:] - angles @ at)
+    out = _attitude_excess(equations, spread)
     little = np.trace(want[:3, :3]) < 0.01 * np.trace(spread[:3, :3])
     np.testing.assert_allclose(out, 0 * want if little else want, rtol=1e-3, atol=1e-6)
     assert (np.trace(out) > 0.1 * np.trace(spread[:6, :6])) == (off > 5)
@@ -280,7 +286,7 @@ def test_a_doubt_is_the_mean_over_both_hypotheses(off: float) -> None:
 def test_points_that_say_nothing_determine_no_position() -> None:
     p, position, rotation = problem(np.random.default_rng(31))
     p.points[:, 8] = 0.0
-    found, settled = fit_pose(p, Fit.at(p, position, rotation))
+    found, settled = fit_pose(p, FitState.from_pose(p, position, rotation))
     assert (settled, assess_fit(found).kind) == (False, "not-determined")
 
 
@@ -302,7 +308,7 @@ def test_what_points_share_grows_with_the_whole_layout(layout, length_m, dark) -
     points = np.where(seen[:, None], 300 + 250 * centres_m, np.nan)
     spec = ErrorModel(shared_along_px=0.05, shared_share=0.002, stretch_share=0.003)
     view = BarView(0, enu_m, points, np.full(len(enu_m), 0.1), (0.1, 0.2, 0.004))
-    found = shared_errors(view, seen, spec, 1.0)
+    found = compute_shared_errors(view, seen, spec, 1.0)
     longest = math.hypot(0.05, 0.002 * 250 * length_m)
     assert np.linalg.eigvalsh(found.root)[-1] == pytest.approx(longest, rel=1e-9)
     assert found.survey == pytest.approx([0.1, 0.2, 0.005])
@@ -313,14 +319,14 @@ def test_protection_levels_hold_with_any_bar_at_fault() -> None:
     p, position, rotation = problem(np.random.default_rng(12), 3, noise=1.0)
     p = dataclasses.replace(p, spec=dataclasses.replace(p.spec, bar_fault_m=0.0))
     fit = fit_problem(p, position, rotation)
-    found, spread = assess_fit(fit), fit.spread
+    found, spread = assess_fit(fit), fit.covariance
     assert isinstance(found, Pose)
     risk = stats.chi2.isf(SPEC.risk, 1)
     for b in range(3):
         bars = fit.bars
-        column = bars.info[b, :, :6] * p.free[:, None]
-        own, side = bars.info[b, :6, :6], bars.right[b, :6]
-        value, freedom, added, unseen = _test(own, column, side, spread, np.zeros((6, 6)))
+        column = bars.information[b, :, :6] * p.free[:, None]
+        own, side = bars.information[b, :6, :6], bars.right_side[b, :6]
+        value, freedom, added, unseen = _test_fault(own, column, side, spread, np.zeros((6, 6)))
         assert value == pytest.approx(found.tests[f"bar {b}"])
         hidden = np.sqrt(stats.chi2.isf(SPEC.false_alarm / 2 / len(found.tests), freedom) * np.diag(unseen))
         assert (found.hidden_m >= hidden * (1 - 1e-9)).all()

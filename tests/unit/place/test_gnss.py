@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.gnss import GnssLog, attitude_of, checksum, geoid_m, gnss_fix, read_nmea
-from evlcp_sdk.place.trajectory import GNSS, filter_fixes, smooth_trajectory, trajectory_step
+from evlcp_sdk.place.gnss import GnssLog, add_heading, checksum, geoid_m, read_nmea, to_camera_fix
+from evlcp_sdk.place.trajectory import GNSS, filter_fixes, smooth_trajectory, step_trajectory
 from evlcp_sdk.results.nmea import format_clock, gst
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import LocalAxes
@@ -78,8 +78,8 @@ def test_a_jump_of_satellites_is_left_out() -> None:
     jumped = dataclasses.replace(fixes[40], enu_m=fixes[40].enu_m + np.array([12.0, 0, 0]))
     assert jumped.source == GNSS
     points = filter_fixes(fixes[:40], SPEC)
-    assert trajectory_step(points[-1], jumped, SPEC).misses == 1
-    assert trajectory_step(points[-1], fixes[40], SPEC).misses == 0
+    assert step_trajectory(points[-1], jumped, SPEC).rejected == 1
+    assert step_trajectory(points[-1], fixes[40], SPEC).rejected == 0
 
 
 def test_the_antenna_is_not_the_camera() -> None:
@@ -89,7 +89,7 @@ def test_the_antenna_is_not_the_camera() -> None:
     spec = ErrorModel(antenna_m=(0.5, -1.0, -2.0))
     # Heading east: right is south, forward is east.
     east = Attitude(0.0, 0.0, 90.0, 0.0, math.degrees(0.1))
-    found = gnss_fix(log, 0, axes, east, spec)
+    found = to_camera_fix(log, 0, axes, east, spec)
     np.testing.assert_allclose(found.enu_m, [202.0, 300.5, 3.0], atol=1e-3)
     # A heading that is wrong by 0.1 moves the antenna's place by 0.2 to the side, 0.05 along.
     expected = np.diag([0.04, 0.09, 0.25]) + np.outer([0.05, -0.2, 0], [0.05, -0.2, 0])
@@ -97,16 +97,16 @@ def test_the_antenna_is_not_the_camera() -> None:
     whole = found.noise_m2 + found.standing[GNSS] @ found.standing[GNSS].T
     np.testing.assert_allclose(whole, found.covariance_m2)
     assert found.alarms == ("unavailable",)
-    assert gnss_fix(log, 0, axes, Attitude(0.0, 0.0), spec) is None
-    assert gnss_fix(log, 0, axes, None, ErrorModel()) is not None
+    assert to_camera_fix(log, 0, axes, Attitude(0.0, 0.0), spec) is None
+    assert to_camera_fix(log, 0, axes, None, ErrorModel()) is not None
 
 
 def test_headings_for_the_antenna() -> None:
     compass, gravity = Attitude(1.0, 2.0, 3.0), Attitude(1.0, 2.0, None, 0.3)
-    assert attitude_of(compass, None) is compass
-    assert attitude_of(None, None) is None
-    assert attitude_of(gravity, (-10.0, 0.5)) == Attitude(1.0, 2.0, 350.0, 0.3, 0.5)
-    assert attitude_of(None, (10.0, 0.5)).gravity_sigma_deg == pytest.approx(10)
+    assert add_heading(compass, None) is compass
+    assert add_heading(None, None) is None
+    assert add_heading(gravity, (-10.0, 0.5)) == Attitude(1.0, 2.0, 350.0, 0.3, 0.5)
+    assert add_heading(None, (10.0, 0.5)).gravity_sigma_deg == pytest.approx(10)
 
 
 HEAD = "t_us,latitude_deg,longitude_deg,height_m,sigma_east_m,sigma_north_m,sigma_up_m"

@@ -11,10 +11,10 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.fit import three_point_poses
+from evlcp_sdk.place.fit import solve_three_points
 from evlcp_sdk.place.fit_assessment import Pose
 from evlcp_sdk.place.observations import BarView, Problem, Rejection, project_bars
-from evlcp_sdk.place.pose import estimate_fault, fitting_focal_mm, solve_pose
+from evlcp_sdk.place.pose import estimate_fault, search_focal_mm, solve_pose
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from tests.unit.place.place_scenes import POINTS_ONLY, Floats, bar, by_chance, square
@@ -53,7 +53,7 @@ def draw_scene(
 ) -> tuple[list[BarView], Attitude | None, CameraSigma]:  # fmt: skip
     """A camera at the origin that looks up, with every error drawn from its stated sigma."""
     true = replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + focal * rng.normal()))
-    seen, shaken = [], rng.normal(0, spec.shaken_sigma_px, 2)
+    seen, shaken = [], rng.normal(0, spec.vibration_sigma_px, 2)
     exact = views([bar(p) for p in places], np.zeros(3), UP.rotation(), rng, noise_px, true, across)
     for view, gap in zip(exact, between, strict=False):
         arm = view.enu_m - view.enu_m.mean(0)
@@ -64,11 +64,11 @@ def draw_scene(
         longways = math.hypot(spec.shared_along_px, spec.shared_share * float(whole @ along) * 16 / 15)
         points = view.points_px + rng.normal(0, longways) * along + gap * shaken
         points = points + rng.normal(0, spec.shared_sigma_px) * np.array([-along[1], along[0]])
-        seen.append(replace(view, enu_m=result, points_px=points, survey=survey, between=gap))
+        seen.append(replace(view, enu_m=result, points_px=points, survey=survey, vibration=gap))
     reported = None
     if known is not None:
         # A bias of each angle, an offset in time that moves all of them, and noise.
-        off = np.degrees(known.standing()) @ rng.normal(size=4) + rng.normal(0, known.white_sigma_deg, 3)
+        off = np.degrees(known.bias_root_rad()) @ rng.normal(size=4) + rng.normal(0, known.white_sigma_deg, 3)
         heading = None if known.heading_deg is None else known.heading_deg + off[2]
         pitch, roll = known.pitch_deg + off[0], known.roll_deg + off[1]
         reported = replace(known, pitch_deg=pitch, roll_deg=roll, heading_deg=heading)
@@ -119,7 +119,7 @@ def test_three_points_give_their_pose_among_the_solutions(seed: int) -> None:
     enu = position + seen @ rotation.T
     sights = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     sides = np.linalg.norm(np.cross(enu[1] - enu[0], enu[2] - enu[0]))
-    found = three_point_poses(enu, sights)
+    found = solve_three_points(enu, sights)
     off = [np.linalg.norm(p - position) for p, _ in found]
     # A triangle seen nearly edge on has nearly double roots, of which half the digits are lost.
     if sides > 5:
@@ -130,7 +130,7 @@ def test_three_points_give_their_pose_among_the_solutions(seed: int) -> None:
 
 ALL = {"survey": SURVEY, "focal": 0.005, "across": 0.5}
 SHIFTED = {"spec": replace(POINTS_ONLY, shared_sigma_px=0.1, shared_along_px=0.1)}
-SHAKEN = {"spec": replace(POINTS_ONLY, shaken_sigma_px=0.5)}
+SHAKEN = {"spec": replace(POINTS_ONLY, vibration_sigma_px=0.5)}
 LATE = Attitude(5.0, 0.0, 0.0, 0.02, 0.02, 0.05, 5000.0, (10.0, -5.0, 45.0))
 
 
@@ -183,7 +183,7 @@ def test_every_error_that_is_stated_is_in_the_covariance(places, known, errors, 
 )
 def test_bars_whose_frames_leave_gaps_at_other_times_err_apart(between, known) -> None:
     """The image moves as one, and each bar's place is interpolated by its own frames."""
-    rng, spec, squares = np.random.default_rng(6), replace(POINTS_ONLY, shaken_sigma_px=0.1), []
+    rng, spec, squares = np.random.default_rng(6), replace(POINTS_ONLY, vibration_sigma_px=0.1), []
     for _ in range(200):
         seen, reported, _ = draw_scene(rng, POLES, known, spec=spec, noise_px=0.05, between=between)
         squares.append(squared_error(as_pose(solve_pose(seen, CAMERA, reported, spec))))
@@ -269,9 +269,9 @@ def test_a_focal_length_that_is_another_lens_is_found(said_mm: float) -> None:
         reported = replace(CAMERA, focal_mm=said_mm)
         found = solve_pose(seen, reported, known)
         assert found.kind == "misfit" if isinstance(found, Rejection) else found.excluded
-        assert fitting_focal_mm(seen, reported, known) == pytest.approx(35.0, rel=0.04)
+        assert search_focal_mm(seen, reported, known) == pytest.approx(35.0, rel=0.04)
     # None fits a bar that is moved aside.
-    assert math.isnan(fitting_focal_mm([move_site(seen[0], 0.0, 0.0, 0.5), seen[1]], CAMERA, UP))
+    assert math.isnan(search_focal_mm([move_site(seen[0], 0.0, 0.0, 0.5), seen[1]], CAMERA, UP))
 
 
 def test_two_sites_mixed_up_are_not_a_third_bar_at_fault() -> None:

@@ -16,7 +16,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.place.bar_registry import BarRegistry
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import Candidate, Rejection, project_bars
-from evlcp_sdk.place.positioner import BarKind, Positioner, _alternatives
+from evlcp_sdk.place.positioner import BarKind, Positioner, _to_alternatives
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedRing
 from evlcp_sdk.scene.camera import CameraModel
@@ -192,7 +192,7 @@ def test_a_mirror_image_is_no_bar(known_from: int) -> None:
     assert_right(late)
     assert {f.transmitters for f in late} == {(0,)}
     assert [repr(f) for f in late] == [repr(f) for f in want[-len(late) :]]
-    assert set(both.bars.stands_at) == {0}
+    assert set(both.bars.known_sites) == {0}
 
 
 def received_beacon(bar: BarSite, trust: Trust, packet: int) -> ReceivedMessage:
@@ -245,10 +245,10 @@ def test_which_beacons_are_believed(beacons, messages, known) -> None:
     registry = BarRegistry([], ErrorModel(beacons=beacons))
     for message, mark in zip(messages, known, strict=True):
         registry.add_packet(Packet(0, 0, 0.0, 100.0, (), 10, messages=(received_beacon(*message),)))
-        found = registry.site(0)
+        found = registry.site_of(0)
         assert (found is None) == (mark == "-")
         if found is not None:
-            assert registry.verified(0) == (mark == "+")
+            assert registry.is_verified(0) == (mark == "+")
             place = ORIGIN.to_enu(found.latitude_deg, found.longitude_deg, found.height_m)
             assert place == pytest.approx([2.0, -6.0, 0.0], abs=0.01)
 
@@ -263,13 +263,13 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
     )
     right = positioner([LEFT, RIGHT], gravity)
     assert_right(fixes_of(right, stream))
-    assert right.bars.contradicted == {}
+    assert right.bars.contradictions == {}
     wrong = positioner(swapped, gravity)
     fixes = fixes_of(wrong, stream)
     assert {f.refusal for f in fixes} == {"site-contradicted"}
     assert "transmitter 0 says that it is 7.2 m from the site of its id" in fixes[0].detail
-    assert wrong.bars.stands_at == {}
-    assert set(wrong.bars.contradicted) == {0, 1}
+    assert wrong.bars.known_sites == {}
+    assert set(wrong.bars.contradictions) == {0, 1}
     # Whoever knows better than the beacons says so; nothing in the image could.
     alone = positioner(swapped, gravity, beacons="none")
     assert not any(f.refusal for f in fixes_of(alone, stream))
@@ -290,9 +290,9 @@ def test_a_bar_that_is_not_its_site(change: dict[str, float], expected: str | No
     """A lone bar of the wrong length or place fits the image as well as the right one."""
     registry = BarRegistry([dataclasses.replace(LEFT, **change)], ErrorModel())
     registry.add_packet(Packet(0, 0, 0.0, 100.0, (), 10, messages=(received_beacon(LEFT, "unverified", 0),)))
-    assert (registry.site(0) is None) == (expected is not None)
-    assert (expected or "") in registry.contradiction(0)
-    assert bool(expected) == bool(registry.contradiction(0))
+    assert (registry.site_of(0) is None) == (expected is not None)
+    assert (expected or "") in registry.contradiction_of(0)
+    assert bool(expected) == bool(registry.contradiction_of(0))
 
 
 def test_an_attitude_file(tmp_path: Path) -> None:
@@ -315,7 +315,7 @@ def test_poses_that_are_left_open_are_reported_on_earth() -> None:
     here, axes = LocalAxes(35.2, 137.1, 60.0), LocalAxes(35.0, 137.0, 50.0)
     spread = np.diag([1.0, 4.0, 9.0])
     open_one = Candidate(np.array([5.0, 6.0, 7.0]), Attitude(1.0, 2.0, 30.0).rotation(), spread, 0.5)
-    (found,) = _alternatives(Rejection("two-solutions", "", (open_one,)), here, axes)
+    (found,) = _to_alternatives(Rejection("two-solutions", "", (open_one,)), here, axes)
     place = here.to_enu(found.latitude_deg, found.longitude_deg, found.height_m)
     np.testing.assert_allclose(place, [5, 6, 7], atol=1e-6)
     np.testing.assert_allclose(axes.to_geodetic(found.enu_m)[2], found.height_m, atol=1e-6)

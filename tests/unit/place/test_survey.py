@@ -12,7 +12,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.place.calibration import CalibrationView
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView, project_bars
-from evlcp_sdk.place.survey import survey
+from evlcp_sdk.place.survey import survey_bars
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
@@ -20,7 +20,7 @@ from tests.unit.place.place_scenes import POINTS_ONLY, square
 
 AXES = LocalAxes(35.0, 137.0, 50.0)
 CAMERA = CameraModel(focal_mm=16.0)
-SPEC = dataclasses.replace(POINTS_ONLY, bend_sigma_px=0)
+SPEC = dataclasses.replace(POINTS_ONLY, curvature_sigma_px=0)
 ROTATION = Attitude(3.0, 1.0, 2.0).rotation()
 
 
@@ -59,7 +59,9 @@ def test_bars_come_back_within_their_sigmas() -> None:
     rng = np.random.default_rng(8)
     squares, wide = [], []
     for _ in range(6):
-        found = survey(views(rng, 0.02, 0.05, 0.002), AXES, 0.96, CAMERA, CameraSigma(focal_mm=0.032), SPEC)
+        found = survey_bars(
+            views(rng, 0.02, 0.05, 0.002), AXES, 0.96, CAMERA, CameraSigma(focal_mm=0.032), SPEC
+        )
         assert [bar.site.transmitter_id for bar in found] == [7, 9]
         for bar, true in zip(found, BARS, strict=True):
             place = LocalAxes.of([true])
@@ -80,12 +82,12 @@ def test_a_bar_that_looks_curved_is_tilted_within_its_sigma() -> None:
     """The perspective of a lean towards the camera is a bend, and the same in all views."""
     rng = np.random.default_rng(12)
     bars = [site_at(7, [0.1, 45.0, 0.2], 6.0, 10.0)]
-    bent = dataclasses.replace(SPEC, bend_sigma_px=0.2)
+    bent = dataclasses.replace(SPEC, curvature_sigma_px=0.2)
     sigmas: dict[ErrorModel, list[float]] = {bent: [], SPEC: []}
     for _ in range(8):
         seen = views(rng, 0.002, 0.002, bend_px=0.2, bars=bars)
         for spec, misses in sigmas.items():
-            (bar,) = survey(seen, AXES, 0.96, CAMERA, spec=spec)
+            (bar,) = survey_bars(seen, AXES, 0.96, CAMERA, spec=spec)
             off = math.degrees(math.acos(min(bar.site.axis_enu() @ bars[0].axis_enu(), 1)))
             misses.append(off / (bar.site.attitude_sigma_deg or 0))
     # Towards the camera a bar leans by far more than across.
@@ -96,9 +98,9 @@ def test_a_bar_that_looks_curved_is_tilted_within_its_sigma() -> None:
 def test_what_cannot_be_surveyed_is_reported() -> None:
     seen = views(np.random.default_rng(10), 0.02, 0.05)
     with pytest.raises(ConfigError, match="needs poses with heading_deg"):
-        survey([dataclasses.replace(seen[0], rotation=None)], AXES, 0.96, CAMERA)
+        survey_bars([dataclasses.replace(seen[0], rotation=None)], AXES, 0.96, CAMERA)
     with pytest.raises(ConfigError, match="no view shows a bar"):
-        survey([dataclasses.replace(view, bars=()) for view in seen], AXES, 0.96, CAMERA)
+        survey_bars([dataclasses.replace(view, bars=()) for view in seen], AXES, 0.96, CAMERA)
     wrong = dataclasses.replace(seen[3], enu_m=seen[3].enu_m + np.array([3.0, 0.0, 0.0]))
     with pytest.raises(ConfigError, match="miss one another"):
-        survey([*seen[:3], wrong, *seen[4:]], AXES, 0.96, CAMERA, spec=SPEC)
+        survey_bars([*seen[:3], wrong, *seen[4:]], AXES, 0.96, CAMERA, spec=SPEC)

@@ -15,9 +15,9 @@ from evlcp_sdk.place.pose import solve_pose
 from evlcp_sdk.place.trajectory import (
     IMU,
     TrajectoryPoint,
+    dead_reckon,
     filter_fixes,
     imu_sigmas,
-    reckon,
     smooth_trajectory,
 )
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, ImuMotion
@@ -36,7 +36,7 @@ def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
     fixes[5] = fix(5e5, np.array([50.0, 0, 0]), NOISE_M2)
     # A refused one has no point.
     points = filter_fixes([*fixes, Fix.from_refusal(1e6, (0,), "misfit", "far off")], SPEC)
-    assert [p.misses for p in points] == [0, 0, 0, 0, 0, 1, 0, 0, 0, 0]
+    assert [p.rejected for p in points] == [0, 0, 0, 0, 0, 1, 0, 0, 0, 0]
     assert abs(points[5].mean[0] - 5) < 0.5
     jumped = fixes[:5] + [fix((5 + i) * 1e5, np.array([1000.0 + i, 0, 0]), NOISE_M2) for i in range(15)]
     points = filter_fixes(jumped, SPEC)
@@ -130,7 +130,7 @@ def test_a_car_that_turns_stays_on_its_track(rate_deg_s: float) -> None:
             facing = np.degrees(heading) + rng.normal(0, 0.02)
             fixes.append(fix(t * 1e6, place + rng.normal(0, 0.02, 3), noise, heading_deg=facing))
         points = filter_fixes(fixes, ErrorModel(acceleration_m2_s3=0.01))
-        assert not any(p.misses for p in points)
+        assert not any(p.rejected for p in points)
         at = 20 + trial % 30
         for found in (points, smooth_trajectory(points, ErrorModel(acceleration_m2_s3=0.01))):
             squares.append(square(found[at].mean[:3] - truth[at], found[at].covariance_m2))
@@ -192,11 +192,11 @@ def test_a_young_track_is_not_believed_against_more_fixes_than_it_has() -> None:
     seen[1] += 12 * SIGMA_M
     points = filter_fixes([fix(t, p, NOISE_M2) for t, p in zip(t_us, seen, strict=True)], SPEC)
     assert [p.starts for p in points].index(True, 1) <= 5
-    assert points[-1].misses == 0
+    assert points[-1].rejected == 0
     assert (abs(points[-1].mean[:3] - seen[-1]) < 5 * np.sqrt(np.diag(points[-1].covariance_m2))).all()
 
 
-STRONG = ErrorModel(acceleration_m2_s3=0.7, rate_white_deg_rts=2.0, push_white_m2_s3=0.3)
+STRONG = ErrorModel(acceleration_m2_s3=0.7, rate_white_deg_rts=2.0, accelerometer_white_m2_s3=0.3)
 VELOCITY = np.array([8.0, 5.0, -1.0])
 
 
@@ -239,20 +239,20 @@ def slopes(of: Callable[[Floats], Floats], size: int) -> Floats:
 @pytest.mark.parametrize("push", [False, True])
 def test_the_way_is_that_of_short_steps(push: bool) -> None:
     way, imu = motion(push), np.array([3.0, 1.0, -2.0, 0.5])[: 4 if push else 1]
-    found = reckon(way, VELOCITY, 0.4, 0.0, imu, STRONG)
+    found = dead_reckon(way, VELOCITY, 0.4, 0.0, imu, STRONG)
     start = np.append(np.zeros(3), VELOCITY)
     np.testing.assert_allclose(
-        found.move @ start + found.added, integrate(way, VELOCITY, 0.4, imu), atol=2e-3
+        found.transition @ start + found.displacement, integrate(way, VELOCITY, 0.4, imu), atol=2e-3
     )
     by_speed = slopes(lambda off: integrate(way, VELOCITY + off, 0.4, imu), 3)
-    np.testing.assert_allclose(found.move[:, 3:], by_speed, atol=1e-3)
+    np.testing.assert_allclose(found.transition[:, 3:], by_speed, atol=1e-3)
     by_imu = slopes(lambda off: integrate(way, VELOCITY, 0.4, imu + off), len(imu))
-    np.testing.assert_allclose(found.by_imu, by_imu, atol=1e-3)
+    np.testing.assert_allclose(found.by_bias, by_imu, atol=1e-3)
 
 
 def test_headings_error_pushes_aside() -> None:
     way, imu = motion(True), np.zeros(4)
-    exact, off = (reckon(way, VELOCITY, 0.4, sigma, imu, STRONG).noise for sigma in (0.0, 0.01))
+    exact, off = (dead_reckon(way, VELOCITY, 0.4, sigma, imu, STRONG).noise for sigma in (0.0, 0.01))
     slope = slopes(lambda turn: integrate(way, VELOCITY, 0.4 + turn[0], imu), 1)
     np.testing.assert_allclose(off - exact, 0.01**2 * slope @ slope.T, atol=1e-4)
 
@@ -261,13 +261,13 @@ def test_headings_error_pushes_aside() -> None:
 def test_noise_is_that_of_kicks(push: bool) -> None:
     """White acceleration, and a gyroscope's random walk, kick by kick through what follows each."""
     way, imu = motion(push), np.zeros(4 if push else 1)
-    white = STRONG.push_white_m2_s3 if push else STRONG.acceleration_m2_s3
+    white = STRONG.accelerometer_white_m2_s3 if push else STRONG.acceleration_m2_s3
     power = np.array([np.radians(STRONG.rate_white_deg_rts) ** 2, *3 * [white]])
     noise = np.zeros((6, 6))
     for s in (np.arange(120) + 0.5) * 3 / 120:
         by = slopes(lambda k, s=s: integrate(way, VELOCITY, 0.4, imu, s, k[0], k[1:]), 4)
         noise += 3 / 120 * (by * power) @ by.T
-    np.testing.assert_allclose(reckon(way, VELOCITY, 0.4, 0.0, imu, STRONG).noise, noise, atol=5e-3)
+    np.testing.assert_allclose(dead_reckon(way, VELOCITY, 0.4, 0.0, imu, STRONG).noise, noise, atol=5e-3)
 
 
 def turning_drive(rng, spec, *, push, rate_deg_s) -> tuple[list[Fix], AttitudeLog, Floats, Floats]:
@@ -293,8 +293,8 @@ def turning_drive(rng, spec, *, push, rate_deg_s) -> tuple[list[Fix], AttitudeLo
     if push:
         # A turn at 10 m/s is a push to its inside.
         felt = np.stack([10 * rate, np.zeros(steps + 1), np.zeros(steps + 1)], 1)
-        felt += biases[1:] * spec.push_sigma_m_s2
-        felt += rng.normal(size=felt.shape) * np.sqrt(spec.push_white_m2_s3 / dt)
+        felt += biases[1:] * spec.accelerometer_sigma_m_s2
+        felt += rng.normal(size=felt.shape) * np.sqrt(spec.accelerometer_white_m2_s3 / dt)
         forces = np.stack([felt[:, 0], -9.80665 - felt[:, 2], felt[:, 1]], 1)
     still = np.zeros(steps + 1)
     rates = np.stack([still, measured, still], 1)
@@ -318,7 +318,7 @@ def test_a_turning_car_is_followed_through_a_gap(push: bool) -> None:
     for _ in range(9):
         fixes, log, truth, biases = turning_drive(rng, spec, push=push, rate_deg_s=45.0)
         points = filter_fixes(fixes, spec, log.motion_between)
-        assert not any(p.misses for p in points)
+        assert not any(p.rejected for p in points)
         smooth = smooth_trajectory(points, spec)
         # 37 is the last fix before the gap, 38 the first one behind it.
         for name, found in (("forward", points), ("smoothed", smooth)):

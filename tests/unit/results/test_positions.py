@@ -25,7 +25,7 @@ from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.gnss import GnssLog, geoid_m
 from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
 from evlcp_sdk.place.observations import project_bars
-from evlcp_sdk.place.trajectory import trajectory_step
+from evlcp_sdk.place.trajectory import step_trajectory
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.report.recording import plot_positions, seconds_since
 from evlcp_sdk.results.folder import ResultFolder
@@ -176,7 +176,7 @@ def test_covariance_and_integrity_are_in_every_file(tmp_path: Path) -> None:
     assert fix.alarms == ("excluded", "unavailable")
     assert wrong.alarms == ("misfit",)
     assert Fix.from_refusal(3e6, (0,), "heading-unknown", "").alarms == ()
-    point = trajectory_step(None, fix, ErrorModel())
+    point = step_trajectory(None, fix, ErrorModel())
     place = Place(2e6, 35.0, 137.0, 5.0, point.mean[:3], point.covariance_m2, 0.0, 0.0, False, True)
     with ResultFolder(tmp_path, ["fixes.csv", "fixes.nmea", "fixes.geojson"]) as folder:
         run = Run("", LINK, PositionPlan((SITE,)), Navigator(LINK, PositionPlan((SITE,))), None)
@@ -248,7 +248,7 @@ def test_bars_and_satellites_that_contradict_one_another(tmp_path: Path) -> None
     plan = PositionPlan((SITE,), satellites([1e6]))
     link = load_link(overrides=["position.antenna_m=[1,0,0]"])
     way = Navigator(link, plan, Attitude(5.0, 0.0))
-    way.note_span(0, 2e6)
+    way.extend_span(0, 2e6)
     assert way.close() == ([], ())
     assert way.counts["gnss_without_heading"] == 1
     write(tmp_path / "late", packets(4), PositionPlan((SITE,), satellites([1e9, 2e9])))

@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView
-from evlcp_sdk.place.points import bar_point, points_at, unseen_px
+from evlcp_sdk.place.points import interpolate_points, locate_bar, sampling_error_px
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 from evlcp_sdk.values import Frame, Range, SoftSymbols
 from tests.unit.place.place_scenes import POINTS_ONLY, Floats, by_chance, frame, square
 
 SPEC = ErrorModel(pixel_sigma_px=0.08)
-EXACT = replace(SPEC, pixel_sigma_px=0.0, early_sigma_us=0.0)
+EXACT = replace(SPEC, pixel_sigma_px=0.0, timing_sigma_us=0.0)
 T_US = (np.arange(9) - 4.3) * 3600.0
 BAR_PX = np.stack([np.full(16, 300.0), 200.0 + 8.0 * np.arange(16)], 1)
 LINE_M = np.stack([np.zeros(16), 0.06 * np.arange(16), np.zeros(16)], 1)
@@ -30,7 +30,7 @@ def view_of_frames(points_px, sigma_px, spec=SPEC, layout_m=LINE_M, flank_px=mat
         replace(frame(points, sigma_px, t), points_flank_px=flank_px)
         for t, points in zip(t_us.tolist(), points_px, strict=True)
     ]
-    found = points_at(7, frames, 0.0, 40_000.0, layout_m, spec)
+    found = interpolate_points(7, frames, 0.0, 40_000.0, layout_m, spec)
     assert found is not None
     return found
 
@@ -139,22 +139,23 @@ def test_what_a_thin_line_does_not_show_is_that_of_a_sampled_profile() -> None:
             light = np.clip((width_px / 2 - away) / steep_px + 0.5, 0, 1)
             errors.append((light @ columns) / light.sum(1) - places)
         # Of a step, the second wave has a quarter of the first one's power.
-        assert 0.95 <= np.var(errors) / unseen_px(steep_px / 0.9) ** 2 <= 1.5
-    assert unseen_px(2.0) == unseen_px(math.nan) == 0.0
+        assert 0.95 <= np.var(errors) / sampling_error_px(steep_px / 0.9) ** 2 <= 1.5
+    assert sampling_error_px(2.0) == sampling_error_px(math.nan) == 0.0
 
 
 @pytest.mark.parametrize(("step_px", "least", "most"), [(0.0, 1.0, 1.0), (0.2, 0.9, 1.0), (5.0, 0.7, 0.85)])
 def test_what_is_not_shown_averages_as_the_image_moves(step_px: float, least: float, most: float) -> None:
     points = BAR_PX + T_US[:, None, None] / 3600.0 * np.array([step_px, 0.0])
-    assert least - 1e-9 <= view_of_frames(points, 0.1, flank_px=0.6).shift_px / unseen_px(0.6) <= most + 1e-9
+    share = view_of_frames(points, 0.1, flank_px=0.6).shift_px / sampling_error_px(0.6)
+    assert least - 1e-9 <= share <= most + 1e-9
     assert view_of_frames(points, 0.1).shift_px == 0.0
 
 
 def test_a_moving_image_is_seen_early_or_late_by_its_speed() -> None:
     for px_per_ms in (0.0, 2.0, 6.0):
         points = BAR_PX + T_US[:, None, None] / 1000.0 * np.array([0.6, -0.8]) * px_per_ms
-        found = view_of_frames(points, 0.1, replace(SPEC, early_sigma_us=15.0))
-        assert found.early_px == pytest.approx(0.015 * px_per_ms, abs=1e-12)
+        found = view_of_frames(points, 0.1, replace(SPEC, timing_sigma_us=15.0))
+        assert found.timing_px == pytest.approx(0.015 * px_per_ms, abs=1e-12)
 
 
 def test_a_gap_beside_a_fix_is_known_by_how_far_a_polynomial_may_be_off() -> None:
@@ -165,12 +166,12 @@ def test_a_gap_beside_a_fix_is_known_by_how_far_a_polynomial_may_be_off() -> Non
         found = view_of_frames(points, 0.1, t_us=t_us)
         midway = 1e-16 * 0.5625 * 3600.0**4
         off = abs(found.points_px[:, 0].mean() - 300.0)
-        assert found.between == pytest.approx(off / midway, rel=1e-6)
+        assert found.vibration == pytest.approx(off / midway, rel=1e-6)
 
 
 BENT = CameraModel(focal_mm=8.0, k1=-0.2, k2=0.05, p1=1e-3, p2=-1e-3, centre_x_px=650.0, centre_y_px=350.0)
 LENS = CameraSigma(0.04, 2.0, 2.0, 0.01, 0.01, 1e-4, 1e-4)
-STRETCHED = replace(POINTS_ONLY, shaken_sigma_px=0.1, shared_sigma_px=0.17320508, shared_share=0.002)
+STRETCHED = replace(POINTS_ONLY, vibration_sigma_px=0.1, shared_sigma_px=0.17320508, shared_share=0.002)
 STRETCHED = replace(STRETCHED, shared_along_px=ErrorModel.shared_along_px, stretch_share=0.004)
 SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
 
@@ -182,29 +183,29 @@ def ranged_frame(x_px: float, y_px: float, distance_m: float, sigma_m: float) ->
 def test_the_point_is_the_one_that_is_seen() -> None:
     true = np.array([3.0, -2.0, 40.0])
     x, y = BENT.project(true)
-    found = bar_point(ranged_frame(x, y, 40.0, 0.1), 0.96, BENT)
+    found = locate_bar(ranged_frame(x, y, 40.0, 0.1), 0.96, BENT)
     np.testing.assert_allclose(found.point_m, true, atol=1e-6)
     # The sigma of the distance is along the line of sight, not along the axis.
     along = true / 40.0
     spec = replace(POINTS_ONLY, stretch_share=0.001)
-    exact = bar_point(ranged_frame(x, y, 40.0, 0.1), 0.96, BENT, spec=spec)
+    exact = locate_bar(ranged_frame(x, y, 40.0, 0.1), 0.96, BENT, spec=spec)
     stretched = 0.1**2 + (40 * 0.001) ** 2
     np.testing.assert_allclose(exact.covariance_m2, stretched * np.outer(along, along), atol=1e-9)
     # Without a distance, or its sigma, there is none.
     for distance_m in (math.nan, 40.0):
-        assert bar_point(ranged_frame(x, y, distance_m, math.nan), 0.96, BENT) is None
+        assert locate_bar(ranged_frame(x, y, distance_m, math.nan), 0.96, BENT) is None
 
 
 def test_what_bends_a_bar_stays_over_frames() -> None:
     bent = replace(ranged_frame(640.0, 360.0, 40.0, 0.5), range=Range(40.0, 0.5, 10, standing_m=0.4))
-    found = bar_point(bent, 0.96, BENT, spec=replace(POINTS_ONLY, stretch_share=0.0))
-    straight = bar_point(ranged_frame(640.0, 360.0, 40.0, 0.5), 0.96, BENT, spec=POINTS_ONLY)
+    found = locate_bar(bent, 0.96, BENT, spec=replace(POINTS_ONLY, stretch_share=0.0))
+    straight = locate_bar(ranged_frame(640.0, 360.0, 40.0, 0.5), 0.96, BENT, spec=POINTS_ONLY)
     np.testing.assert_allclose(found.covariance_m2, straight.covariance_m2, rtol=1e-3, atol=1e-6)
     assert found.standing[2, 7] == pytest.approx(0.4)
     frames = [replace(frame(BAR_PX, 0.1, t), range=bent.range) for t in T_US.tolist()]
     for some, stretch in ((9, 0.01), (5, 0.01), (4, 0.0)):
         near = frames[:some] + [replace(one, range=Range(40.0, 0.1, 10)) for one in frames[some:]]
-        view = points_at(7, near, 0.0, 40_000.0, LINE_M, SPEC)
+        view = interpolate_points(7, near, 0.0, 40_000.0, LINE_M, SPEC)
         assert view.stretch == pytest.approx(stretch)
 
 
@@ -221,7 +222,7 @@ def test_every_error_is_in_its_covariance() -> None:
         x, y = lens.project(true) + rng.normal(0, shift, 2)
         # By its length in the image a bar is the farther, the longer the lens is said to be.
         distance = 25 * BENT.focal_px / lens.focal_px * (1 + 0.004 * rng.normal()) + 0.15 * rng.normal()
-        found = bar_point(ranged_frame(x, y, distance, 0.15), 0.96, BENT, LENS, STRETCHED)
+        found = locate_bar(ranged_frame(x, y, distance, 0.15), 0.96, BENT, LENS, STRETCHED)
         squares.append(square(found.point_m - true, found.covariance_m2))
     assert by_chance(squares, 3, 0.999)
     assert np.linalg.eigvalsh(found.covariance_m2 - found.standing @ found.standing.T)[0] > 0
