@@ -20,13 +20,13 @@ const style = (name) => getComputedStyle(document.documentElement).getPropertyVa
 
 // What comes
 
-function clear() {
+function clearResults() {
   zero = null; bins = new Map(); rates = []; rows = []; messages = []; status = null; ended = null;
   fixes = []; track = []; sites = []; refused = null; counted = []; distances.clear();
   shown.pictures = shown.frames = shown.fixes = 0; shown.last = [];
 }
 
-function take(news) {
+function takeNews(news) {
   dirty = true;
   if (news.t_us !== undefined && news.line !== "message") zero = zero === null ? news.t_us : zero;
   if (news.line === "frame") {
@@ -76,9 +76,9 @@ function take(news) {
 
 const image = by("image").querySelector("canvas"), caption = by("image").querySelector("figcaption");
 const zooms = new Map();
-let bitmap = null, told = null, bars = [];
+let bitmap = null, picture = null, bars = [];
 
-function dots(pen, bar, scale, left, top) {
+function drawDots(pen, bar, scale, left, top) {
   bar.points.forEach((point, k) => {
     if (point === null) return;
     const x = (point[0] + 0.5 - left) * scale, y = (point[1] + 0.5 - top) * scale;
@@ -91,7 +91,7 @@ function dots(pen, bar, scale, left, top) {
   });
 }
 
-function fit(canvas, ratio) {
+function fitCanvas(canvas, ratio) {
   const wide = canvas.clientWidth, dpr = window.devicePixelRatio || 1;
   const w = Math.round(wide * dpr), h = Math.round(wide * ratio * dpr);
   if (canvas.width !== w || canvas.height !== h) {
@@ -103,25 +103,25 @@ function fit(canvas, ratio) {
 
 function drawImage() {
   if (bitmap === null || !about) return;
-  const [pen, wide] = fit(image, bitmap.height / bitmap.width);
+  const [pen, wide] = fitCanvas(image, bitmap.height / bitmap.width);
   const scale = wide / bitmap.width, dpr = window.devicePixelRatio || 1;
   pen.imageSmoothingEnabled = scale < 1;
   pen.drawImage(bitmap, 0, 0, bitmap.width * scale, bitmap.height * scale);
   pen.lineWidth = dpr;
   pen.strokeStyle = "rgb(190 190 190)";
-  for (const [, x, y, w, h] of told.regions) {
+  for (const [, x, y, w, h] of picture.regions) {
     pen.strokeRect((x - w / 2 - 2) * scale, (y - h / 2 - 2) * scale, (w + 4) * scale, (h + 4) * scale);
   }
   pen.font = `${12 * dpr}px system-ui, sans-serif`;
   for (const bar of bars) {
-    dots(pen, bar, scale, 0, 0);
+    drawDots(pen, bar, scale, 0, 0);
     pen.fillStyle = "#fff";
     const news = distances.get(bar.transmitter), far = meters(news, 1);
     const text = bar.echo_of === null ? `${bar.transmitter}: ${far} m` : `reflection of ${bar.echo_of}`;
     const at = Math.min((bar.x_px + 12) * scale, wide - pen.measureText(text).width - 4 * dpr);
     pen.fillText(text, at, bar.y_px * scale);
   }
-  caption.textContent = `events of ${told.window_us / 1e3} ms at ${fixed(told.t_us / 1e6, 3)} s; `
+  caption.textContent = `events of ${picture.window_us / 1e3} ms at ${fixed(picture.t_us / 1e6, 3)} s; `
     + "yellow: brighter, blue: darker; boxes: regions";
   drawZooms();
 }
@@ -139,19 +139,19 @@ function drawZooms() {
       zooms.set(bar.transmitter, figure);
     }
     const figure = zooms.get(bar.transmitter), news = distances.get(bar.transmitter);
-    const region = told.regions.find(([, x, y, w, h]) =>
+    const region = picture.regions.find(([, x, y, w, h]) =>
       Math.abs(x - bar.x_px) < w / 2 + 4 && Math.abs(y - bar.y_px) < h / 2 + 4);
     let high = region ? Math.max(region[3], region[4]) : 0;
     for (const point of bar.points) if (point) high = Math.max(high, 2 * Math.abs(point[1] - bar.y_px));
     high = Math.max(16, high * 1.25);
     const wide = high * 0.75, left = bar.x_px - wide / 2, top = bar.y_px - high / 2;
-    const [pen, w] = fit(figure.firstChild, high / wide);
+    const [pen, w] = fitCanvas(figure.firstChild, high / wide);
     const scale = w / wide;
     pen.imageSmoothingEnabled = false;
     pen.fillStyle = "rgb(16 16 20)";
     pen.fillRect(0, 0, w, w * high / wide);
     pen.drawImage(bitmap, left, top, wide, high, 0, 0, w, w * high / wide);
-    dots(pen, bar, scale, left, top);
+    drawDots(pen, bar, scale, left, top);
     figure.lastChild.textContent = `bar ${bar.transmitter}` + (news ? `: ${meters(news, 2)} m, quality ${fixed(news.quality, 2)}` : "");
   }
 }
@@ -230,7 +230,7 @@ function drawMap() {
   by("fix").textContent = text;
   const map = by("map"), dpr = window.devicePixelRatio || 1;
   const ratio = map.clientWidth < 500 ? 0.9 : 0.42;
-  const [pen, wide] = fit(map, ratio), high = map.height;
+  const [pen, wide] = fitCanvas(map, ratio), high = map.height;
   pen.clearRect(0, 0, wide, high);
   const places = [...fixes.map((fix) => fix.track_m), ...sites.map((site) => site.slice(1))];
   if (!places.length) return;
@@ -289,7 +289,7 @@ function tile(label, value, unit, note) {
   return div;
 }
 
-function fill(id, rows) {
+function fillTable(id, rows) {
   by(id).replaceChildren(...rows.map((cells) => make("tr", ...cells.map((one) => make("td", one)))));
 }
 
@@ -336,10 +336,10 @@ function drawWords() {
   by("alarm").textContent = alarms.join(" ");
   by("alarm").hidden = !alarms.length;
 
-  fill("frames", [...rows].reverse().map((news) => [ms(news.t_us), news.transmitter, news.packet, news.frame,
+  fillTable("frames", [...rows].reverse().map((news) => [ms(news.t_us), news.transmitter, news.packet, news.frame,
     digits(news.distance_m, 2), fixed(news.quality, 2), symbols(news)]));
 
-  fill("messages", messages.map((one) =>
+  fillTable("messages", messages.map((one) =>
     [fixed(one.t_us / 1e6, 2), one.transmitter, one.transmitter_id, one.kind, one.trust, one.said]));
   by("silent").hidden = messages.length > 0;
 
@@ -353,7 +353,7 @@ function drawWords() {
   }
   if (shown.dropped) lost.push(["results this browser was too slow for", shown.dropped]);
   if (record && record.dropped) lost.push(["pieces the recording was too slow for", record.dropped]);
-  fill("lost", lost.map(([name, n]) => [name.replaceAll("_", " "), n.toLocaleString("en")]));
+  fillTable("lost", lost.map(([name, n]) => [name.replaceAll("_", " "), n.toLocaleString("en")]));
   by("whole").hidden = lost.length > 0;
 
   const button = by("record");
@@ -381,21 +381,21 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { di
 
 // The connection
 
-function state(text, on) {
+function showState(text, on) {
   by("state").textContent = text;
   by("state").className = on ? "on" : "";
 }
 
-async function bundle(data) {
+async function receiveBundle(data) {
   const size = new DataView(data).getUint32(0, true);
   const head = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, size)));
-  head.news.forEach(take);
+  head.news.forEach(takeNews);
   shown.dropped = head.dropped;
   if (JSON.stringify(head.record) !== JSON.stringify(record)) { record = head.record; dirty = true; }
   if (head.picture) {
     const next = await createImageBitmap(new Blob([new Uint8Array(data, 4 + size)], { type: "image/png" }));
     if (bitmap) bitmap.close();
-    bitmap = next; told = head.picture; bars = head.bars;
+    bitmap = next; picture = head.picture; bars = head.bars;
     shown.pictures++;
     drawImage();
   }
@@ -409,19 +409,19 @@ function connect() {
     if (typeof event.data === "string") {
       about = JSON.parse(event.data).about;
       // The same run sends what is kept of it again.
-      if (run === about.run) { messages = []; fixes = []; } else clear();
+      if (run === about.run) { messages = []; fixes = []; } else clearResults();
       run = about.run;
       shown.connects++;
       wait = 250;
-      state("live", true);
+      showState("live", true);
     } else {
-      await bundle(event.data);
+      await receiveBundle(event.data);
     }
     // A credit: what came is shown.
     if (mine.readyState === 1) mine.send('{"next": true}');
   };
   mine.onclose = () => {
-    state(ended ? "ended" : "connection lost, trying again", false);
+    showState(ended ? "ended" : "connection lost, trying again", false);
     dirty = true;
     if (!ended) setTimeout(connect, wait);
     wait = Math.min(2 * wait, 4000);
