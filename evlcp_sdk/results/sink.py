@@ -43,10 +43,10 @@ class Run:
     @property
     def filtered(self) -> bool:
         """Whether any link filters distances, so that there are columns for them."""
-        from evlcp_sdk.rx.guard import tracker_of
+        from evlcp_sdk.rx.guard import compile_tracker
 
         links = self.links.values() or [self.link]
-        return any(tracker_of(link).distance is not None for link in links)
+        return any(compile_tracker(link).distance is not None for link in links)
 
 
 class Sink:

@@ -1,4 +1,4 @@
-"""A frame with the bar held still: the image of a moving bar, chip by chip, and where its clusters are."""
+"""Aligned frames: the image of a moving bar held still, chip by chip, and its clusters."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -12,15 +12,22 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements, without
+from evlcp_sdk.rx.placement import (
+    Placement,
+    drop_clusters,
+    drop_hidden_clusters,
+    find_placements,
+    layout_of,
+    mask_presence,
+)
 from evlcp_sdk.rx.regions import MARGIN_PX, TrackedRegion
 from evlcp_sdk.values import Events, PresenceMap, SyncLock
 
-_LEAST_CLUSTERS = 0.5
-"""Share of the clusters that must be in their place in a frame: fewer may be another bar's."""
+_MIN_CLUSTER_SHARE = 0.5
+"""Least share of the clusters in their place in a frame: fewer may be another bar's."""
 
-_EVEN = 0.01
-"""Steps from cluster to cluster are a spacing where they are longer by rounding only."""
+_EVEN_TOLERANCE = 0.01
+"""Steps from cluster to cluster are a spacing if they are longer by this share at most, of rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +39,12 @@ class DueFrame:
         packet: Number of its packet on the grid.
         index: Its number in the packet.
         chips: Its length, with its pilot if it has one.
-        has_pilot: Whether it has.
+        has_pilot: Whether it has one.
         packet_us: Start of its packet's preamble, us.
         start_us: Start of its first chip, us.
         end_us: When the events of its last edge end, us.
-        lock: What these times come from.
-        read_us: When those of the chips after it that are read with it end, too, us.
+        lock: The lock that gives these times.
+        read_us: When the events of the chips that are read after it end, too, us.
         middle_us: See `AlignedFrame`.
     """
 
@@ -55,16 +62,16 @@ class DueFrame:
 
 
 class Pilot(NamedTuple):
-    """The pilot that the frames up to the next one go by.
+    """The newest pilot, by which the frames up to the next one are read.
 
     Attributes:
         frame: Number of its frame on the packet grid.
         size_px: (width, height) of the image, px.
         sums: Its polarity sums, int16 (chips, height, width).
         offset_px: The rest of the motion in it, float64 (2, chips), px.
-        presence: What it shows; the bar is held still, so it shows the same in the frames after it.
-        placement: Where it shows the layout.
-        others: Other instances of it in the same image, best first: mirror images, and bars in step with it.
+        presence: Of the clusters; the bar is held still, so that it holds in the frames after it.
+        placement: Of the layout.
+        others: Other instances in the same image, best first: mirror images, and bars in step with it.
     """
 
     frame: int
@@ -80,7 +87,7 @@ class AlignedFrame(NamedTuple):
     """A frame with the bar held still.
 
     Attributes:
-        pilot: The pilot that it goes by, its own if it has one.
+        pilot: The newest pilot, its own if it has one.
         sums_and_next: Polarity sums of pilot and info segment, and of the chips after the frame
             (`Codebook.trailing_chips`), int16 (chips, height, width).
         offset_px: The rest of the motion in pilot and info segment, float64 (2, chips), px.
@@ -109,14 +116,14 @@ class AlignedFrame(NamedTuple):
 
 
 class FrameAligner:
-    """Looks at one frame after the other; a pilot is handed on to the frames after it.
+    """Aligns one frame after the other; the newest pilot is passed in with each.
 
     Args:
         packet: Lengths of a packet's parts.
         spec: Length of a time step, seam, and least share of the clusters.
         centres_m: Cluster centres of the layout, m, float64 (K, 2).
         codebook: The codes of the clusters' pilots.
-        separate: From a pilot's polarity sums to where the clusters are.
+        separate: From a pilot's polarity sums to the presence of the clusters.
         sensor_px: Columns and rows of the sensor: no image is larger, but for the seam.
     """
 
@@ -134,32 +141,32 @@ class FrameAligner:
         self._layout = layout_of(centres_m)
         # Clusters in an even grid are one strip, however near it is.
         across_m = np.diff(np.sort(centres_m[:, 0]))
-        self._apart = bool((across_m > (1 + _EVEN) * self._layout.spacing_m).any())
+        self._has_columns = bool((across_m > (1 + _EVEN_TOLERANCE) * self._layout.spacing_m).any())
         self._edges = codebook.pilot_edges.astype(np.int64)
         self._every = codebook.edge_spacing_chips
-        self._telling = slice(1, packet.pilot_chips, self._every)
+        self._code_chips = slice(1, packet.pilot_chips, self._every)
         self._after = codebook.trailing_chips
         self._separate = separate
         self._sensor_px = sensor_px
-        self._halves: NDArray[np.float64] = (
+        self._chip_middles: NDArray[np.float64] = (
             np.arange(packet.frame_chips + self._after, dtype=np.float64) + 0.5
         )
 
     def align(self, region: TrackedRegion, due: DueFrame, pilot: Pilot | None) -> AlignedFrame | None:
-        """Hold a frame's image still, and find its clusters; None if it does not show them.
+        """Hold a frame's image still and find its clusters; None if it does not show them.
 
         Args:
             region: The bar's.
             due: Which frame.
-            pilot: The newest one of the bar that showed it.
+            pilot: The newest of the bar.
         """
         lock, packet = due.lock, self._packet
         start_us, chip_us = float(due.start_us), float(lock.chip_us)
-        centre_px = region.track.centres_at(self._halves[: due.chips + self._after], start_us, chip_us)
+        centre_px = region.track.centres_at(self._chip_middles[: due.chips + self._after], start_us, chip_us)
         middle = min(due.chips, packet.pilot_chips) // 2
         seen_us = due.middle_us + chip_us / 2
         if due.has_pilot:
-            size = self._size(*region.track.size_at(seen_us))
+            size = self._image_size(*region.track.size_at(seen_us))
         elif pilot is None or pilot.frame != due.number - due.index + packet.pilot_frame(due.index):
             return None
         else:
@@ -167,70 +174,73 @@ class FrameAligner:
         pieces = region.pieces_between(due.start_us, due.read_us, self._spec.step_us)
         sums, offset_px = polarity_sums((e for _, e in pieces), lock, due.start_us, centre_px, size)
         if due.has_pilot:
-            heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
-            presence = self._separate(heard)
+            pilot_sums, pilot_offset_px = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
+            presence = self._separate(pilot_sums)
             before = pilot.placement if pilot is not None else None
-            found = placements(presence, self._layout, before, _LEAST_CLUSTERS)
+            found = find_placements(presence, self._layout, before, _MIN_CLUSTER_SHARE)
             if not found:
                 return None
-            presence = masked(presence, self._layout, found[0])
-            presence, placement = lit(heard, self._edges, self._every, presence, found[0])
+            presence = mask_presence(presence, self._layout, found[0])
+            presence, placement = drop_hidden_clusters(
+                pilot_sums, self._edges, self._every, presence, found[0]
+            )
             if True not in placement.seen.tolist():
                 return None
-            pilot = Pilot(due.number, size, heard, moved, presence, placement, tuple(found[1:]))
+            pilot = Pilot(
+                due.number, size, pilot_sums, pilot_offset_px, presence, placement, tuple(found[1:])
+            )
         else:
             assert pilot is not None
             sums = np.concatenate([pilot.sums, sums])
             offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
         chips = len(sums) - self._after
-        # The image shows the pilot's mean, read from the chips behind edges that tell codes apart: it lies
-        # where these were looked for in the mean, however much the region's track trembles between chips.
-        told = self._telling
-        rests_x, rests_y = pilot.offset_px[:, told].tolist()
-        many = len(rests_x)
+        # The image is the pilot's mean over the chips behind edges that tell codes apart: it is where these
+        # were sought on average, however much the region's track trembles between chips.
+        rests_x, rests_y = pilot.offset_px[:, self._code_chips].tolist()
+        count = len(rests_x)
         if due.has_pilot:
-            total_x, total_y = np.add.reduce(centre_px[:, told], 1).tolist()
-            centre_x, centre_y = total_x / many, total_y / many
+            total_x, total_y = np.add.reduce(centre_px[:, self._code_chips], 1).tolist()
+            centre_x, centre_y = total_x / count, total_y / count
         else:
             centre_x, centre_y = centre_px[:, middle].tolist()
         corner_px = (
-            centre_x - (size[0] - 1) / 2 - sum(rests_x) / many,
-            centre_y - (size[1] - 1) / 2 - sum(rests_y) / many,
+            centre_x - (size[0] - 1) / 2 - sum(rests_x) / count,
+            centre_y - (size[1] - 1) / 2 - sum(rests_y) / count,
         )
         return AlignedFrame(pilot, sums, offset_px[:, :chips], corner_px, due.middle_us)
 
-    def box(
+    def bar_box(
         self, aligned: AlignedFrame, placement: Placement
     ) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Centre (column, row) on the sensor and (width, height) of a whole bar, hidden parts too, px.
+        """Centre (column, row) and (width, height) of a whole bar on the sensor, hidden parts too, px.
 
         Args:
             aligned: A frame.
             placement: The bar's own or that of another instance, taken to be as wide.
         """
-        places, right_px, down_px = self._spots(aligned, placement)
+        places, right_px, down_px = self._cluster_extents(aligned, placement)
         columns, rows = places.real.tolist(), places.imag.tolist()
         left, right = min(columns) - right_px, max(columns) + right_px
         top, bottom = min(rows) - down_px, max(rows) + down_px
         x, y = aligned.corner_px
         return (x + (left + right) / 2, y + (top + bottom) / 2), (right - left, bottom - top)
 
-    def whole(self, aligned: AlignedFrame) -> PresenceMap:
-        """What a frame shows, without the clusters that the edge of the sensor cuts.
+    def drop_cut_clusters(self, aligned: AlignedFrame) -> PresenceMap:
+        """Presence in a frame without the clusters that the edge of the sensor cuts.
 
-        They would be measured by what is left of them, nearer to the others than they are: those whose
-        middle is nearer to it than half a spacing. A line of clusters stays as it is.
+        They would be measured by what is left of them, nearer to the others than they are: those whose middle
+        is nearer to the edge than half a spacing. A line of clusters stays as it is.
         """
         presence, placement = aligned.pilot.presence, aligned.pilot.placement
-        if self._layout.line or placement.scale == 0:
+        if self._layout.is_line or placement.scale == 0:
             return presence
-        places, right_px, down_px = self._spots(aligned, placement)
+        places, right_px, down_px = self._cluster_extents(aligned, placement)
         x, y = places.real + aligned.corner_px[0], places.imag + aligned.corner_px[1]
         width, height = self._sensor_px
         cut = (x < right_px) | (x > width - 1 - right_px) | (y < down_px) | (y > height - 1 - down_px)
-        return without(presence, cut) if cut.any() else presence
+        return drop_clusters(presence, cut) if cut.any() else presence
 
-    def lit_rows(self, aligned: AlignedFrame) -> tuple[float, float] | None:
+    def light_rows(self, aligned: AlignedFrame) -> tuple[float, float] | None:
         """Upper and lower edge of the clusters that a frame shows, from the whole bar's centre, px.
 
         None where it shows both ends.
@@ -238,7 +248,7 @@ class FrameAligner:
         placement = aligned.pilot.placement
         if placement.scale == 0 or False not in placement.seen.tolist():
             return None
-        places, _, down_px = self._spots(aligned, placement)
+        places, _, down_px = self._cluster_extents(aligned, placement)
         rows = places.imag
         shown = rows[placement.seen].tolist()
         top, bottom, first, last = float(rows.min()), float(rows.max()), min(shown), max(shown)
@@ -247,16 +257,15 @@ class FrameAligner:
             return None
         return first - down_px - centre, last + down_px - centre
 
-    def strips(self, aligned: AlignedFrame) -> NDArray[np.float64] | None:
-        """Columns that a bar's light stands in: (middle from the bar's centre, half of the width), px.
+    def light_strips(self, aligned: AlignedFrame) -> NDArray[np.float64] | None:
+        """Columns of a bar's light: (middle from the bar's centre, half of the width), px, float64 (n, 2).
 
-        float64 (n, 2); None where there is one strip, or none that is dark for as far as a bar may move in a
-        step lies between two.
+        None for one strip, or without a dark one between two that is wider than a bar may move in a step.
         """
         placement = aligned.pilot.placement
-        if not self._apart or placement.scale == 0:
+        if not self._has_columns or placement.scale == 0:
             return None
-        places, right_px, _ = self._spots(aligned, placement)
+        places, right_px, _ = self._cluster_extents(aligned, placement)
         across = np.sort(places.real)
         ends = np.flatnonzero(np.diff(across) > 2 * (right_px + MARGIN_PX))
         if not len(ends):
@@ -265,10 +274,10 @@ class FrameAligner:
         centre = (across[0] + across[-1]) / 2
         return np.stack([(first + last) / 2 - centre, (last - first) / 2 + right_px], 1)
 
-    def _spots(
+    def _cluster_extents(
         self, aligned: AlignedFrame, placement: Placement
     ) -> tuple[NDArray[np.complex128], float, float]:
-        """Where an instance's clusters are in the image, and how far each reaches to its sides, px."""
+        """Where an instance's clusters are in the image, and how far each reaches right and down, px."""
         selected, grid = aligned.pilot.presence.selected, aligned.pilot.presence.grid_px
         own, layout = aligned.pilot.placement, self._layout
         if own.scale == 0:
@@ -277,19 +286,19 @@ class FrameAligner:
             right_px = down_px = grid / 2
         else:
             along_px = across_px = abs(own.scale) * layout.spacing_m / 2
-            way = placement.scale / abs(placement.scale)
-            if layout.line:
-                # A line's width is that of its cells; the layout says nothing of it.
-                turn = own.scale / abs(own.scale) * layout.way
+            direction = placement.scale / abs(placement.scale)
+            if layout.is_line:
+                # A line's width is that of its cells, as the layout does not have it.
+                turn = own.scale / abs(own.scale) * layout.direction
                 across_px = _kernels.farthest_offset_px(selected, grid, own.shift, turn) + grid / 2
-                way *= layout.way
-            places = placement.places(layout)
-            right_px = along_px * abs(way.real) + across_px * abs(way.imag)
-            down_px = along_px * abs(way.imag) + across_px * abs(way.real)
+                direction *= layout.direction
+            places = placement.centres_px(layout)
+            right_px = along_px * abs(direction.real) + across_px * abs(direction.imag)
+            down_px = along_px * abs(direction.imag) + across_px * abs(direction.real)
         return places, right_px, down_px
 
-    def _size(self, width_px: float, height_px: float) -> tuple[int, int]:
-        """Of the image: a region's, its seam on both sides, made even."""
+    def _image_size(self, width_px: float, height_px: float) -> tuple[int, int]:
+        """The size of a region's image with its seam on both sides, made even."""
         seam_px = 2 * MARGIN_PX
         width_px, height_px = min(width_px, self._sensor_px[0]), min(height_px, self._sensor_px[1])
         # Twice an odd number: a bar of one or two columns stands in the middle of a cell of 2 px, not on the
@@ -304,14 +313,14 @@ def polarity_sums(
     centre_px: NDArray[np.float64],
     size_px: tuple[int, int],
 ) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
-    """Sum polarities (+1, -1) by chip and pixel, the bar held still in the middle to within half a pixel.
+    """Sum polarities (+1, -1) by chip and pixel, with the bar held still to within half a pixel.
 
     Returns:
         The sums, int16 (chips, height, width); and the rest of the motion, (right, down) of the bar's centre
         from the middle of the image in each chip, float64 (2, chips), px.
 
     Args:
-        events: Pieces of the stream that hold the chips; events outside them are passed over.
+        events: Pieces of the stream that hold the chips; events outside them are ignored.
         lock: Length of a chip, and the delays of positive and negative events, and by row.
         start_us: Start of the first chip, us.
         centre_px: Column and row of the bar's centre in each chip, float64 (2, chips), px.
@@ -319,10 +328,10 @@ def polarity_sums(
     """
     width, height = size_px
     chips = centre_px.shape[1]
-    # Rows wait for the bar's own, wherever they are.
+    # Delays by row are relative to the bar's row.
     row_px = sum(centre_px[1].tolist()) / chips
     sums, offset_px = np.zeros((chips, height, width), np.int16), np.zeros((2, chips))
-    # Whatever kinds of numbers a synchronization gives.
+    # A synchronization may give any kind of number.
     on_us, off_us = float(start_us + lock.delay_on_us), float(start_us + lock.delay_off_us)
     chip_us, row_us = float(lock.chip_us), float(lock.row_us)
     for e in events:

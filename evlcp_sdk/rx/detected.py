@@ -10,7 +10,7 @@ import numpy as np
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Detector
-from evlcp_sdk.rx.guard import Guard, compiled
+from evlcp_sdk.rx.guard import Guard, compile_algorithm
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.regions import (
     BACKFILL_STEPS,
@@ -34,7 +34,7 @@ class DetectorTracker(RegionTracker):
 
     def __init__(self, link: Link, limits: Limits = LIMITS) -> None:
         self._guard = Guard(link, "detection")
-        self._detector: Detector = compiled(
+        self._detector: Detector = compile_algorithm(
             link, "detection", link.camera, link.codebook, link.packet, methods=("init", "step")
         )
         self._limits = limits

@@ -14,7 +14,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Synchronizer
 from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame
 from evlcp_sdk.rx.framer import Framer, StreamContext, record_light
-from evlcp_sdk.rx.guard import Guard, compiled
+from evlcp_sdk.rx.guard import Guard, compile_algorithm
 from evlcp_sdk.rx.reading import BarDecoder, FrameDecoder, FrameJob, FrameResult, LocalBarDecoder
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
 from evlcp_sdk.rx.regions import (
@@ -164,7 +164,7 @@ class PacketFraming(Framer):
         self._clock = stream.clock
         self._announcer, self._on_frame = stream.announcer, on_frame
         self._sync_guard = Guard(link, "synchronization")
-        self._synchronizer: Synchronizer = compiled(
+        self._synchronizer: Synchronizer = compile_algorithm(
             link, "synchronization", link.codebook, link.packet, methods=("init", "step")
         )
         self._decoder, self._aligner = decoder, decoder.aligner
@@ -304,7 +304,7 @@ class PacketFraming(Framer):
                     transmitter.sync, events.t_us, events.p, until_us
                 )
             except (Exception, SystemExit) as fault:
-                guard.blame(fault)
+                guard.reraise(fault)
                 raise
             if guard.checks:
                 guard.expect_locks(locks, until_us, self._packet)

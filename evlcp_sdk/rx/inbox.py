@@ -222,7 +222,7 @@ class MessageAssembler:
             return self._coder.decode_block(llr)
         except (Exception, SystemExit) as fault:
             if self._guard is not None:
-                self._guard.blame(fault)
+                self._guard.reraise(fault)
             raise
 
     def _take(self, inbox: _Inbox, block: Block, packet: Packet) -> list[ReceivedMessage]:

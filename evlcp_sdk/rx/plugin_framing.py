@@ -11,7 +11,7 @@ from evlcp_sdk.clock import TimeStep
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Deframer
 from evlcp_sdk.rx.framer import Framer, StreamContext, record_light
-from evlcp_sdk.rx.guard import Guard, compiled
+from evlcp_sdk.rx.guard import Guard, compile_algorithm
 from evlcp_sdk.rx.reflections import FrameDetection, PacketAssembler, ReflectionQueue
 from evlcp_sdk.rx.regions import TrackedRegion
 from evlcp_sdk.values import DecodedFrame, Frame, Range
@@ -61,7 +61,7 @@ class PluginFraming(Framer):
         on_frame: Callable[[Frame], None] | None,
     ) -> None:
         self._guard = Guard(link, "framing")
-        self._deframer: Deframer = compiled(
+        self._deframer: Deframer = compile_algorithm(
             link, "framing", link.codebook, link.packet, methods=("init", "step", "close", "counts")
         )
         self._codebook, self._packet = link.codebook, link.packet

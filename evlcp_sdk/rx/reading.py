@@ -14,12 +14,12 @@ from evlcp_sdk.plugin.roles import Tracker
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame, FrameAligner, Pilot
 from evlcp_sdk.rx.framer import Announcer
-from evlcp_sdk.rx.guard import Guard, compiled, tracker_of
+from evlcp_sdk.rx.guard import Guard, compile_algorithm, compile_tracker
 from evlcp_sdk.rx.placement import layout_of
-from evlcp_sdk.rx.points import points_finder
+from evlcp_sdk.rx.points import compile_finder
 from evlcp_sdk.rx.ranges import RangeCorrector, RangeState
 from evlcp_sdk.rx.regions import MARGIN_PX, BarPlace, TrackedRegion
-from evlcp_sdk.rx.spread import LateSpread, Spread, neighbours
+from evlcp_sdk.rx.spread import LazySpread, Spread, neighbour_pairs
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.tilt import LineOfSight, line_of_sight, magnification_of
 from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
@@ -71,9 +71,9 @@ class Steps:
         self._announcer = announcer
         self._guards = {role: Guard(link, role) for role in ("separation", "decoding", "ranging")}
         book = link.codebook
-        self._separate = compiled(link, "separation", book)
-        self._decode: Callable[..., SoftSymbols] = compiled(link, "decoding", book)
-        self._measure = compiled(link, "ranging", link.camera, link.bar, book)
+        self._separate = compile_algorithm(link, "separation", book)
+        self._decode: Callable[..., SoftSymbols] = compile_algorithm(link, "decoding", book)
+        self._measure = compile_algorithm(link, "ranging", link.camera, link.bar, book)
         self._distance = tracker.distance
 
     def init_distance(self) -> tuple[RangeState, Any]:
@@ -251,10 +251,10 @@ class FrameReader:
         self._least_half = _DIMMED_SHARE if book.is_pair_coded else 0.0
         self._steps, self._aligner = steps, aligner
         self._layout = layout_of(centres_m)
-        self._pairs = neighbours(self._layout)
+        self._pairs = neighbour_pairs(self._layout)
         self._pilots, self._every = book.pilots.astype(np.int64), book.edge_spacing_chips
         edges = edges_of_chips(book.pilots).astype(np.int64)
-        self._find_points = points_finder(self._layout, edges, book.edge_spacing_chips)
+        self._find_points = compile_finder(self._layout, edges, book.edge_spacing_chips)
         self._behind = [chips_after_frame(book, link.packet, n) for n in range(link.packet.frames)]
         for chips in self._behind:
             chips.setflags(write=False)
@@ -299,14 +299,14 @@ class FrameReader:
             )
         distance = _NO_RANGE
         if ranged:
-            whole = self._aligner.whole(aligned)
+            whole = self._aligner.drop_cut_clusters(aligned)
             distance = self._steps.measure(FrameView(sums, aligned.offset_px, whole, soft))
         pilot_sums = sums[: self._pilot_chips]
         points_px, sigma_px, flank_px, centre_px = self._find_points(
             presence, placement, pilot_sums, aligned.corner_px
         )
         # It is needed for two images at one time only; so the pilot alone is kept, not the whole frame.
-        spread = LateSpread(
+        spread = LazySpread(
             pilot_sums.copy(), self._pilots, self._every, self._layout, self._pairs, placement
         )
         image = points_px, sigma_px, flank_px, centre_px
@@ -332,7 +332,7 @@ class FrameDecoder:
     """
 
     def __init__(self, link: Link, announcer: Announcer | None = None) -> None:
-        self.steps = Steps(link, announcer, tracker_of(link))
+        self.steps = Steps(link, announcer, compile_tracker(link))
         self.aligner = FrameAligner(
             link.packet,
             link.regions,
@@ -370,9 +370,11 @@ class FrameDecoder:
     def locate_bar(self, aligned: AlignedFrame) -> BarPlace:
         """Where a frame with a pilot shows its bar."""
         aligner, pilot = self.aligner, aligned.pilot
-        box = aligner.box(aligned, pilot.placement)
-        others = tuple(aligner.box(aligned, other) for other in pilot.others)
-        return BarPlace(aligned.middle_us, *box, aligner.lit_rows(aligned), aligner.strips(aligned), others)
+        box = aligner.bar_box(aligned, pilot.placement)
+        others = tuple(aligner.bar_box(aligned, other) for other in pilot.others)
+        return BarPlace(
+            aligned.middle_us, *box, aligner.light_rows(aligned), aligner.light_strips(aligned), others
+        )
 
     def read(
         self,

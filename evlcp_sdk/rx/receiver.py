@@ -15,7 +15,7 @@ from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx.detected import DetectorTracker
 from evlcp_sdk.rx.framer import Announcer, Framer, StreamContext, to_camera_time
 from evlcp_sdk.rx.framing import PacketFraming
-from evlcp_sdk.rx.guard import tracker_of
+from evlcp_sdk.rx.guard import compile_tracker
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.multi import EarlyFrames, SeveralLinks, share_detectors
@@ -258,7 +258,7 @@ class LinkReceiver:
     ) -> None:
         self.name = name
         self._clock, self._announcer = stream.clock, stream.announcer
-        tracker = tracker_of(link)
+        tracker = compile_tracker(link)
         self._regions: RegionTracker
         follower: RhythmTracker | None = None
         if link.algorithm("detection").rhythmic:

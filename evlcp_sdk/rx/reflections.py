@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.regions import SAME_PX
-from evlcp_sdk.rx.spread import Spread, compare
+from evlcp_sdk.rx.spread import Spread, compare_spreads
 from evlcp_sdk.values import Frame, Packet, replace_fields
 
-TRAILING_CHIPS = 2.5
+COMPLETE_AFTER_CHIPS = 2.5
 """The last events of a frame come late, some later than its clock says: it is complete if its light goes on
 for two chips after those due. The stream ends with the latest event, which is later than its light by more
 than the mean of those that the clock is set by: a tenth of a chip to a quarter, as latencies and rows spread,
@@ -217,7 +217,7 @@ class _Pair:
         mirror_odds = _MIRRORED_ODDS * self.mirrored / max(self.frames, 1)
         frames_lit = max(self.frames_lit, 1)
         if self.spread is not None and self.spread[0].frames >= self.frames_compared * _COMPARE_AGAIN:
-            self.compared, self.frames_compared = compare(*self.spread), self.spread[0].frames
+            self.compared, self.frames_compared = compare_spreads(*self.spread), self.spread[0].frames
         seen = self.seen / frames_lit
         if self.compared is None:
             return mirror_odds + brightness_odds(self.light / frames_lit) + _COMPLETE_ODDS * seen
@@ -439,7 +439,7 @@ class ReflectionQueue:
         if detection is None:
             return assembler.flush()
         frame = detection.frame
-        if detection.end_us + TRAILING_CHIPS * detection.chip_us > self.stream_end_us:
+        if detection.end_us + COMPLETE_AFTER_CHIPS * detection.chip_us > self.stream_end_us:
             self.frames_cut += 1
             return []
         echo_of = self.reflections.echo_of(frame.transmitter)

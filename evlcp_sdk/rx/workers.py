@@ -326,7 +326,7 @@ def load_kernels(link: Link) -> None:
     """Decode two frames of a drawn bar, a clear one and one of few events: takes a second, the first time."""
     book, rng = link.codebook, np.random.default_rng(0)
     layout = layout_of(link.bar.cluster_centres_m())
-    centres = layout.at_m * _DRAWN_PX / layout.spacing_m
+    centres = layout.centres_m * _DRAWN_PX / layout.spacing_m
     middle = complex(link.camera.width, link.camera.height) / 2
     side = np.arange(_DRAWN_PX - 2) - _DRAWN_PX // 2
     places = np.rint(centres - centres.mean() + middle)[:, None, None] + side + 1j * side[:, None]

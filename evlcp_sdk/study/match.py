@@ -14,7 +14,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.shared import find_differences
-from evlcp_sdk.rx.reflections import TRAILING_CHIPS
+from evlcp_sdk.rx.reflections import COMPLETE_AFTER_CHIPS
 from evlcp_sdk.sim.truth import SentBar, Truth
 from evlcp_sdk.study.frames import FrameRow
 
@@ -24,7 +24,7 @@ NEAREST_PX = 60.0
 """How far from a bar's centre a frame may lie and still be the bar's: the image and the receiver's regions
 decide this, not the link."""
 
-TAIL_CHIPS = TRAILING_CHIPS
+TAIL_CHIPS = COMPLETE_AFTER_CHIPS
 """A frame was sent whole if the recording goes on for this long after it, as the receiver asks. It asks so by
 its own clock, which is late by as much as events are in the mean, 0.15 to 0.95 chips at 30 kHz: what it gives
 was sent whole, and it may leave out a frame that was, in one recording of a hundred."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from evlcp_sdk.rx.placement import layout_of, masked, placements
+from evlcp_sdk.rx.placement import find_placements, layout_of, mask_presence
 from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid
 from evlcp_sdk.values import PresenceMap
 
@@ -54,9 +54,9 @@ def cover_clusters(presence, clusters):
 @given(st.floats(40, 200), st.floats(-math.pi, math.pi), st.floats(0, 2), st.floats(0, 2))
 def test_a_bar_at_any_size_and_turn(px_per_m, turn, right, down):
     scale, shift = px_per_m * np.exp(1j * turn), complex(112 + right, 112 + down)
-    (found,) = placements(draw_cells(CENTRES, (scale, shift), size=(224, 224)), LINE)
+    (found,) = find_placements(draw_cells(CENTRES, (scale, shift), size=(224, 224)), LINE)
     # A cell is two pixels wide.
-    assert np.abs(found.places(LINE) - scale * LINE.at_m - shift).max() < 1.5
+    assert np.abs(found.centres_px(LINE) - scale * LINE.centres_m - shift).max() < 1.5
     assert found.seen.all()
     assert found.chance < 1e-6
 
@@ -67,7 +67,7 @@ def test_clutter_and_a_cover(seed):
     hidden = sorted(rng.choice(16, 8, replace=False).tolist())
     scale, shift = 150 * np.exp(0.02j), 24.3 + 110.2j
     presence = add_clutter(cover_clusters(draw_cells(CENTRES, (scale, shift)), hidden), rng, 0.05)
-    found = placements(presence, LINE)[0]
+    found = find_placements(presence, LINE)[0]
     # The centre is the layout's, not that of the part that is seen.
     assert abs(found.shift - shift) < 1.5
     assert abs(found.scale - scale) < 4
@@ -77,11 +77,11 @@ def test_clutter_and_a_cover(seed):
 def test_a_reflection_beside_stays_out_of_the_footprints():
     bar, image = (100 + 0j, 12.0 + 60j), (100 + 0j, 34.0 + 60j)
     presence = draw_cells(CENTRES, bar, image, size=(48, 120))
-    found = placements(presence, LINE)
+    found = find_placements(presence, LINE)
     assert len(found) == 2
     assert sorted(round(f.shift.real) for f in found) == [12, 34]
     for f in found:
-        only = masked(presence, LINE, f)
+        only = mask_presence(presence, LINE, f)
         assert only.selected.any((1, 2)).all()
         columns = np.flatnonzero(only.selected.any((0, 1))) * 2 + 0.5
         assert np.abs(columns - f.shift.real).max() < 4
@@ -105,20 +105,20 @@ def test_bayes_cell_by_cell(seed):
 
 def test_few_clusters_are_enough_where_the_scale_is_known():
     whole = draw_cells(CENTRES, (150, 24 + 110j))
-    (before,) = placements(whole, LINE)
+    (before,) = find_placements(whole, LINE)
     for hidden in (range(11), range(5, 16), [k for k in range(16) if k not in (2, 6, 7, 8, 13)]):
-        (found,) = placements(cover_clusters(whole, hidden), LINE, before)
+        (found,) = find_placements(cover_clusters(whole, hidden), LINE, before)
         assert abs(found.shift - (24 + 110j)) < 2
         assert found.seen.sum() == 5
     # Three could be there by chance.
-    assert not placements(cover_clusters(whole, range(13)), LINE, before)
+    assert not find_placements(cover_clusters(whole, range(13)), LINE, before)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_clusters_out_of_their_order_are_no_bar(seed):
     presence = draw_cells(CENTRES[np.random.default_rng(seed).permutation(16)], (150, 24 + 110j))
-    (before,) = placements(draw_cells(CENTRES, (150, 24 + 110j)), LINE)
-    assert placements(presence, LINE) == placements(presence, LINE, before) == []
+    (before,) = find_placements(draw_cells(CENTRES, (150, 24 + 110j)), LINE)
+    assert find_placements(presence, LINE) == find_placements(presence, LINE, before) == []
 
 
 @pytest.mark.parametrize("conj", [False, True])
@@ -126,11 +126,11 @@ def test_a_panel_and_its_mirror_image(conj):
     centres = PANEL.cluster_centres_m()
     layout = layout_of(centres)
     scale, shift = 300 * np.exp(0.1j), 64.2 + 63.7j
-    (found,) = placements(draw_cells(centres, (scale, shift), size=(128, 128), conj=conj), layout)
+    (found,) = find_placements(draw_cells(centres, (scale, shift), size=(128, 128), conj=conj), layout)
     assert found.mirrored == conj
     assert abs(found.shift - shift) < 1
     assert np.abs(found.scale - scale) < 6
-    places = found.places(layout)
+    places = found.centres_px(layout)
     assert np.abs(places[1] - places[0]) == pytest.approx(300 * 0.08, rel=0.03)
 
 
@@ -143,17 +143,17 @@ def test_one_column_of_two_is_not_taken_for_the_other_in_a_mirror(column):
         scale = 120 * np.exp(0.01j * rng.normal())
         shift = complex(24, 60) + complex(*rng.uniform(-1, 1, 2)) - scale * (2 * column - 1)
         shown = draw_cells(centres, (scale, shift), size=(48, 120))
-        found += placements(cover_clusters(shown, np.arange(8) + 8 - 8 * column), layout_of(centres))[:1]
+        found += find_placements(cover_clusters(shown, np.arange(8) + 8 - 8 * column), layout_of(centres))[:1]
     assert [one.mirrored for one in found] == [False] * 24
 
 
 def test_one_cluster_is_where_its_cells_are():
     layout, presence = layout_of(np.zeros((1, 2))), draw_cells(np.zeros((1, 2)), size=(40, 40))
     presence.selected[0, 3:5, 7:9] = True
-    (found,) = placements(presence, layout)
+    (found,) = find_placements(presence, layout)
     assert found.shift == 15.5 + 7.5j
-    assert masked(presence, layout, found) is presence
+    assert mask_presence(presence, layout, found) is presence
 
 
 def test_nothing_seen_is_nowhere():
-    assert placements(draw_cells(CENTRES), LINE) == []
+    assert find_placements(draw_cells(CENTRES), LINE) == []

@@ -10,8 +10,8 @@ from rx_streams import LINK, frames_of, receive_cut
 
 from evlcp_sdk.files import find_shipped_file
 from evlcp_sdk.io import read_events
-from evlcp_sdk.rx.placement import layout_of, placements
-from evlcp_sdk.rx.points import points_finder
+from evlcp_sdk.rx.placement import find_placements, layout_of
+from evlcp_sdk.rx.points import compile_finder
 from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.sim import Simulation, load_scene
 from evlcp_sdk.sim.motion import project
@@ -41,9 +41,9 @@ def points_of(presence, centres_m=CENTRES, at_px=(0.0, 0.0), pixels=None, **plac
     layout = layout_of(centres_m)
     light = np.rint(100 * presence.pixels).astype(np.int16)
     sums = np.concatenate([np.zeros_like(light[:1]), light])
-    placement = replace(placements(presence, layout)[0], **placed)
+    placement = replace(find_placements(presence, layout)[0], **placed)
     seen = presence if pixels is None else replace_fields(presence, pixels=pixels)
-    return points_finder(layout, np.eye(len(light), dtype=np.int64), 1)(seen, placement, sums, at_px)
+    return compile_finder(layout, np.eye(len(light), dtype=np.int64), 1)(seen, placement, sums, at_px)
 
 
 def truth_of(turn, shift, layout):

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import evlcp_sdk as evlcp
-from evlcp_sdk.rx.spread import Spread, compare, expected_lengths
+from evlcp_sdk.rx.spread import Spread, compare_spreads, model_lengths
 
 
 def pixel_light(lit, per_px, sigma_px):
@@ -44,16 +44,16 @@ def test_expected_lengths_against_light_by_brute_force(blur_px):
         ((other > 0.25 * background)[way].mean() - 0.5) * spacing,
         (lower[np.abs(row - 2 * spacing).argmin()] > 0.25 * background * peak).sum() / per_px,
     )
-    (found,) = expected_lengths(spacing, np.array([blur_px]), [background])
+    (found,) = model_lengths(spacing, np.array([blur_px]), [background])
     assert found == pytest.approx(want, abs=0.2)
 
 
 def sharper(one, other):
-    return compare(one, other)[0]
+    return compare_spreads(one, other)[0]
 
 
 def is_alike(one, other):
-    return compare(one, other)[1]
+    return compare_spreads(one, other)[1]
 
 
 def answering(lengths, spacing_px=9.0, frames=1):
@@ -72,22 +72,22 @@ def answering(lengths, spacing_px=9.0, frames=1):
 def test_lengths_of_answers():
     want = np.array([0.4, 1.6, 4.3])
     for frames in (1, 7):
-        assert answering(want, frames=frames).lengths() == pytest.approx(want, abs=0.01)
+        assert answering(want, frames=frames).lengths_px() == pytest.approx(want, abs=0.01)
     both = answering(want) + answering(want)
     assert both.frames == 2
-    assert both.lengths() == pytest.approx(want, abs=0.01)
+    assert both.lengths_px() == pytest.approx(want, abs=0.01)
     # What lies beyond a dark column is another image's.
     beside = answering(want)
     beside.across[0, -2:] = 10_000
-    assert beside.lengths() == pytest.approx(want, abs=0.01)
+    assert beside.lengths_px() == pytest.approx(want, abs=0.01)
 
 
 def test_what_pixels_do_not_say_is_not_known():
     some = answering(np.array([0.4, 1.6, 4.3]))
     nothing, noise = (replace(some, between=np.full_like(some.between, n)) for n in (0, 5))
-    assert nothing.lengths() is noise.lengths() is compare(some, nothing) is None
+    assert nothing.lengths_px() is noise.lengths_px() is compare_spreads(some, nothing) is None
     panel = replace(some, across=np.zeros_like(some.across))
-    assert math.isnan(panel.lengths()[2])
+    assert math.isnan(panel.lengths_px()[2])
     assert sharper(panel, panel) == pytest.approx(0)
 
 
@@ -101,8 +101,8 @@ CASES = product((0.01, 0.03, 0.3), (0.1, 0.3, 0.6, 1.0), (0.0, 0.6, 1.0, 1.5))
 
 @pytest.mark.parametrize(("background", "share", "blur_px"), [c for c in CASES if dim_background(*c) < 2])
 def test_the_sharper_and_brighter_one_is_the_bar(background, share, blur_px):
-    (bar,) = expected_lengths(9.0, np.array([0.0]), [background])
-    (image,) = expected_lengths(9.0, np.array([blur_px]), [dim_background(background, share, blur_px)])
+    (bar,) = model_lengths(9.0, np.array([0.0]), [background])
+    (image,) = model_lengths(9.0, np.array([blur_px]), [dim_background(background, share, blur_px)])
     odds = [sharper(answering(bar, frames=n), answering(image, frames=n)) for n in (1, 10)]
     assert sharper(answering(image), answering(bar)) == pytest.approx(-odds[0])
     if blur_px or share < 1:
@@ -117,15 +117,15 @@ def test_the_sharper_and_brighter_one_is_the_bar(background, share, blur_px):
 @pytest.mark.parametrize("farther", [1.0, 1.1, 1.5])
 def test_two_bars_are_alike_and_images_are_not(background, farther):
     """Also where one is farther: its strip is narrower, and the light of a pixel less by as much."""
-    (bar,) = expected_lengths(9.0, np.zeros(1), [background])
-    (other,) = expected_lengths(9.0 / farther, np.zeros(1), [background * farther])
+    (bar,) = model_lengths(9.0, np.zeros(1), [background])
+    (other,) = model_lengths(9.0 / farther, np.zeros(1), [background * farther])
     assert is_alike(answering(bar, frames=10), answering(other, 9.0 / farther, frames=10)) > 1.5
     assert is_alike(answering(other, 9.0 / farther, 10), answering(bar, frames=10)) > 1.5
     # One of .7 of the light may be dirty, one of a third is a mirror.
-    (weaker,) = expected_lengths(9.0, np.zeros(1), [background / 0.7])
+    (weaker,) = model_lengths(9.0, np.zeros(1), [background / 0.7])
     assert is_alike(answering(bar, frames=10), answering(weaker, frames=10)) > 0
     for share, blur_px in ((0.33, 0.0), (0.2, 0.0), (1.0, 1.0)):
-        (image,) = expected_lengths(9.0, np.array([blur_px]), [dim_background(background, share, blur_px)])
+        (image,) = model_lengths(9.0, np.array([blur_px]), [dim_background(background, share, blur_px)])
         assert is_alike(answering(bar, frames=10), answering(image, frames=10)) < -0.5
 
 
@@ -150,5 +150,5 @@ def test_a_blurred_image_in_a_window_is_not_the_bar():
 
 def test_what_is_clear_for_long_stays_clear():
     """After minutes the other hypothesis is less likely than the smallest number that is not 0."""
-    bar, image = expected_lengths(25.0, np.zeros(1), [0.004, 0.3])
+    bar, image = model_lengths(25.0, np.zeros(1), [0.004, 0.3])
     assert 745 < sharper(answering(bar, 25.0, 10_000), answering(image, 25.0, 10_000)) < math.inf
