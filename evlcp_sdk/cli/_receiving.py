@@ -46,7 +46,7 @@ class LinkOptions:
 
         links = load_links(self.link_files, self.overrides or [], registry)
         if len(links) > 1:
-            from evlcp_sdk.diagnosis.of_light import find_alike_links
+            from evlcp_sdk.diagnosis.light_checks import find_alike_links
 
             for warning in find_alike_links(name_links(links)):
                 complain(f"warning: {warning}")

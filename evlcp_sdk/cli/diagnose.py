@@ -77,7 +77,7 @@ def _show(found: Diagnosis) -> None:
         stages.add_row(one.stage, Text(word, style), one.statement)
     out.print(stages)
     if found.sources:
-        cells = [light.cells() for light in found.sources[:8]]
+        cells = [light.table_cells() for light in found.sources[:8]]
         print_table(out, list(cells[0]), [list(one.values()) for one in cells], names=0)
         if len(found.sources) > 8:
             out.print(f"and {len(found.sources) - 8} more", style="dim")

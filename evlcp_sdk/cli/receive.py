@@ -175,7 +175,7 @@ def _fitted(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:
     with open_source(job.url, registry) as source:
         trials = infer_link(source, link, registry)
     best = trials[0]
-    for said in dict.fromkeys(one.said for one in trials if one.said):
+    for said in dict.fromkeys(one.explanation for one in trials if one.explanation):
         complain(f"{Path(job.url).name}: {said}")
     name, due = Path(job.url).name, best.frames + best.rejected
     if not best.fits:

@@ -1,4 +1,4 @@
-"""Loops over events, compiled."""
+"""The loop over events, compiled."""
 
 from typing import Any
 
@@ -10,18 +10,18 @@ from evlcp_sdk.kernels import njit
 Array = NDArray[Any]
 
 FINE_US, FINE = 10, 256
-"""Width and number of the bins of short intervals: 1 / f of chips down to 400 a second."""
+"""Width and number of the bins of short intervals: chips down to 400 a second."""
 
 COARSE_US, COARSE = 100, 256
-"""The same of those beyond, to 28 ms: lamps on mains."""
+"""The same of longer ones, to 28 ms: lamps on mains."""
 
 SHORT = 128
-"""Bins of `FINE_US` of the time from one event of a pixel to its next."""
+"""Bins of `FINE_US` of the times between events of a pixel."""
 
 BINS = FINE + COARSE
 
-SOONEST_US = 60
-"""Time after a rise in which no other counts: two chips at 30 kHz. Events of strong light ring so long."""
+MIN_RISE_US = 60
+"""Time after a rise in which no other counts, two chips at 30 kHz: events of strong light ring so long."""
 
 
 @njit
@@ -32,13 +32,13 @@ def add_events(
     shift: int,
     calm_us: int,
 ) -> None:
-    """Add events to what is counted of each cell of 2^shift px.
+    """Count events, and the times between them, in cells of 2^shift px.
 
     A rise is a positive event after a negative one of its pixel, or after `calm_us` without any, and not
-    within SOONEST_US of the one before. Of each pixel are the time of its last event, int64, its polarity,
-    uint8, and its last rise, int64, all (height, width). Counted are the times from rise to rise, uint32
-    (rows, columns, BINS), those from event to event, uint32 (rows, columns, SHORT), and the events, int64
-    (rows, columns, 2).
+    within MIN_RISE_US of the one before. `of_pixels` are the time of each pixel's last event, int64, its
+    polarity, uint8, and the pixel's last rise, int64, all (height, width). `counts` are the times from rise
+    to rise, uint32 (rows, columns, BINS), those from event to event, uint32 (rows, columns, SHORT), and the
+    events, int64 (rows, columns, 2).
     """
     t_us, x, y, p = events
     last_us, last_p, rise_us = of_pixels
@@ -51,7 +51,7 @@ def add_events(
             gaps[r, c, gap // FINE_US] += np.uint32(1)
         signs[r, c, sign] += 1
         since = t - rise_us[row, column]
-        if sign and since >= SOONEST_US and (last_p[row, column] == 0 or gap > calm_us):
+        if sign and since >= MIN_RISE_US and (last_p[row, column] == 0 or gap > calm_us):
             if since < FINE_US * FINE:
                 intervals[r, c, since // FINE_US] += np.uint32(1)
             elif since < FINE_US * FINE + COARSE_US * COARSE:

@@ -1,6 +1,6 @@
-"""The one list of checks: `receive` shows those that find something wrong, `diagnose` all, by stage.
+"""The one list of checks: `receive` shows their warnings, `diagnose` all of them, by stage.
 
-A check is a generator of what it finds wrong, or of the count by which it is passed.
+A check is a generator of diagnostics, or of the counts by which it is passed.
 """
 
 from collections import defaultdict
@@ -8,129 +8,142 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from evlcp_sdk.diagnosis import of_frames, of_light, of_positions
-from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, Found
+from evlcp_sdk.diagnosis import frame_checks, light_checks, position_checks
+from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, Findings
 
-_Of = Iterator[tuple[tuple[Any, ...], dict[str, Any]]]
-"""What checks take, and whose their findings are."""
+_Subjects = Iterator[tuple[tuple[Any, ...], dict[str, Any]]]
+"""Arguments of checks, and whom their findings are about."""
 
 
-def _of_recording(facts: Facts) -> _Of:
+def _select_recording(facts: Facts) -> _Subjects:
     yield (facts,), {}
 
 
-def _of_bar(facts: Facts) -> _Of:
+def _select_bar(facts: Facts) -> _Subjects:
     if (bar := facts.bar) is not None:
         yield (facts, bar), {}
 
 
-def _of_links(facts: Facts) -> _Of:
+def _select_links(facts: Facts) -> _Subjects:
     for name, part in (facts.parts or {"": facts}).items():
         yield (part,), {"link": name}
 
 
-def _of_transmitters(facts: Facts, own_frames: int = -1) -> _Of:
-    for (part,), whose in _of_links(facts):
+def _select_transmitters(facts: Facts, own_frames: int = -1) -> _Subjects:
+    for (part,), subject in _select_links(facts):
         for number, one in sorted(part.tally.transmitters.items()):
-            if one.frames - one.echoes >= own_frames:
-                yield (part, one), whose | {"transmitter": number}
+            if one.frames - one.echo_frames >= own_frames:
+                yield (part, one), subject | {"transmitter": number}
 
 
-def _of_many_frames(facts: Facts) -> _Of:
-    yield from _of_transmitters(facts, of_frames.FEW_FRAMES)
+def _select_frequent(facts: Facts) -> _Subjects:
+    yield from _select_transmitters(facts, frame_checks.FEW_FRAMES)
 
 
-def _of_positions(facts: Facts) -> _Of:
-    for (part,), whose in _of_links(facts):
+def _select_positions(facts: Facts) -> _Subjects:
+    for (part,), subject in _select_links(facts):
         if part.positions_tried or part.positions.get("gnss") or part.positions.get("gnss_outside"):
-            yield (part,), whose
+            yield (part,), subject
 
 
-CHECKS: tuple[tuple[str, Callable[[Facts], _Of], tuple[Callable[..., Found], ...]], ...] = (
+CHECKS: tuple[tuple[str, Callable[[Facts], _Subjects], tuple[Callable[..., Findings], ...]], ...] = (
     (
         "events",
-        _of_recording,
-        (of_light.check_events, of_light.check_times, of_light.check_room, of_light.check_links),
+        _select_recording,
+        (
+            light_checks.check_events,
+            light_checks.check_times,
+            light_checks.check_room,
+            light_checks.check_links,
+        ),
     ),
-    ("readout", _of_recording, (of_light.check_readout,)),
-    ("light", _of_recording, (of_light.check_light,)),
-    ("polarity", _of_links, (of_light.check_edges,)),
-    ("pixels", _of_bar, (of_light.check_pixels,)),
-    ("size", _of_bar, (of_light.check_size,)),
-    ("focus", _of_bar, (of_light.check_focus,)),
-    ("brightness", _of_bar, (of_light.check_brightness,)),
-    ("chip rate", _of_bar, (of_light.check_rate,)),
-    ("preamble", _of_recording, (of_light.check_preamble,)),
+    ("readout", _select_recording, (light_checks.check_readout,)),
+    ("light", _select_recording, (light_checks.check_light,)),
+    ("polarity", _select_links, (light_checks.check_edges,)),
+    ("pixels", _select_bar, (light_checks.check_pixels,)),
+    ("size", _select_bar, (light_checks.check_size,)),
+    ("focus", _select_bar, (light_checks.check_focus,)),
+    ("brightness", _select_bar, (light_checks.check_brightness,)),
+    ("chip rate", _select_bar, (light_checks.check_rate,)),
+    ("preamble", _select_recording, (light_checks.check_preamble,)),
     (
         "frames",
-        _of_links,
+        _select_links,
         (
-            of_frames.check_frames,
-            of_frames.check_kinds_of_frames,
-            of_frames.check_flooded,
-            of_frames.check_alike,
+            frame_checks.check_frames,
+            frame_checks.check_frame_kinds,
+            frame_checks.check_flooded_frames,
+            frame_checks.check_same_symbols,
         ),
     ),
-    ("frames", _of_transmitters, (of_frames.check_reflection, of_frames.check_restart, of_frames.check_lit)),
-    ("frames", _of_many_frames, (of_frames.check_clock, of_frames.check_hidden)),
-    ("frames", _of_recording, (of_light.check_coverage,)),
-    ("orientation", _of_transmitters, (of_frames.check_orientation,)),
+    (
+        "frames",
+        _select_transmitters,
+        (frame_checks.check_reflection, frame_checks.check_restart, frame_checks.check_light_span),
+    ),
+    ("frames", _select_frequent, (frame_checks.check_clock, frame_checks.check_hidden_clusters)),
+    ("frames", _select_recording, (light_checks.check_coverage,)),
+    ("orientation", _select_transmitters, (frame_checks.check_orientation,)),
     (
         "codewords",
-        _of_many_frames,
+        _select_frequent,
         (
-            of_frames.check_codewords,
-            of_frames.check_symbols,
-            of_frames.check_bit_order,
-            of_frames.check_characters,
+            frame_checks.check_codewords,
+            frame_checks.check_symbols,
+            frame_checks.check_bit_order,
+            frame_checks.check_characters,
         ),
     ),
-    ("distances", _of_many_frames, (of_frames.check_distances, of_frames.check_bent, of_frames.check_size)),
-    ("distances", _of_transmitters, (of_frames.check_length,)),
-    ("messages", _of_links, (of_frames.check_messages,)),
-    ("messages", _of_transmitters, (of_frames.check_packets,)),
+    (
+        "distances",
+        _select_frequent,
+        (frame_checks.check_distances, frame_checks.check_distortion, frame_checks.check_size),
+    ),
+    ("distances", _select_transmitters, (frame_checks.check_length,)),
+    ("messages", _select_links, (frame_checks.check_messages,)),
+    ("messages", _select_transmitters, (frame_checks.check_packets,)),
     (
         "positions",
-        _of_positions,
+        _select_positions,
         (
-            of_positions.check_sigmas,
-            of_positions.check_excluded,
-            of_positions.check_biases,
-            of_positions.check_inputs,
-            of_positions.check_sites,
-            of_positions.check_misfits,
+            position_checks.check_sigmas,
+            position_checks.check_exclusions,
+            position_checks.check_biases,
+            position_checks.check_inputs,
+            position_checks.check_sites,
+            position_checks.check_misfits,
         ),
     ),
 )
-"""Stages in the order in which light passes them, of what their checks are, and these."""
+"""Stages in the order in which light passes them, the subjects of their checks, and these."""
 
 
 def run_checks(facts: Facts) -> list[Diagnostic]:
-    """What each check finds, in their order."""
-    found = []
+    """The findings of all checks, in their order."""
+    findings = []
     for stage, subjects, checks in CHECKS:
-        for known, whose in subjects(facts):
+        for arguments, subject in subjects(facts):
             for check in checks:
-                for one in check(*known):
+                for one in check(*arguments):
                     one = Diagnostic("", one, verdict="pass") if isinstance(one, str) else one
-                    found.append(replace(one, stage=stage, **whose))
-    return found
+                    findings.append(replace(one, stage=stage, **subject))
+    return findings
 
 
-def find_stages(facts: Facts) -> list[Diagnostic]:
-    """All stages but those of positions: what looks wrong where frames are read all the same is a doubt.
+def assess_stages(facts: Facts) -> list[Diagnostic]:
+    """The findings of all stages but those of positions; a stage after one that fails is skipped.
 
-    Where they are not, it is why: stages behind one that fails are not judged.
+    A doubt fails its stage if no frames are read.
     """
     by_stage = defaultdict[str, list[Diagnostic]](list)
     for one in run_checks(facts):
-        # What is lost of a recording stops no light.
-        fails = one.verdict == "doubt" and not facts.reads and one.stage != "events"
+        # Lost events stop no light.
+        fails = one.verdict == "doubt" and not facts.is_read and one.stage != "events"
         by_stage[one.stage].append(replace(one, verdict="fail") if fails else one)
-    shown: list[Diagnostic] = []
-    for stage in dict.fromkeys(name for name, subjects, _ in CHECKS if subjects is not _of_positions):
-        failed = any(one.verdict == "fail" for one in shown)
+    assessed: list[Diagnostic] = []
+    for stage in dict.fromkeys(name for name, subjects, _ in CHECKS if subjects is not _select_positions):
+        failed = any(one.verdict == "fail" for one in assessed)
         text = "not reached" if failed else "too little to tell"
         skipped = Diagnostic("", text, verdict="skip", stage=stage)
-        shown += [skipped] if failed else by_stage[stage] or [skipped]
-    return shown
+        assessed += [skipped] if failed else by_stage[stage] or [skipped]
+    return assessed

@@ -1,4 +1,4 @@
-"""Diagnosis of a recording: one pass through the receiver and past it, then what may be wrong is tried."""
+"""Diagnosis of a recording: one pass through receiver and light survey, then trials of other links."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.diagnosis.checks import find_stages
-from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, other_codewords
+from evlcp_sdk.diagnosis.checks import assess_stages
+from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, find_other_codewords
 from evlcp_sdk.diagnosis.light import LightSource, LightSurvey
-from evlcp_sdk.diagnosis.probe import MOST_EVENTS, Trial, better_links, infer_links, try_link
+from evlcp_sdk.diagnosis.probe import MAX_EVENTS, Trial, infer_links, try_changes, try_link
 from evlcp_sdk.diagnosis.tallies import RunTally
 from evlcp_sdk.io.describe import check_sensor
 from evlcp_sdk.io.open import open_source
@@ -23,28 +23,29 @@ from evlcp_sdk.rx.boxes import mask_inside
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events
 
-_RATE_SHARE = 0.005
-"""How far a measured rate may be off: half of that is seen where rows are read late."""
+_RATE_TOLERANCE = 0.005
+"""Of a measured rate: half of it occurs where rows are read late."""
 
 _TRIAL_US, _LIGHT_US = 400_000, 4_000_000
-"""Time of the events that other links are tried on, some packets, and of a light that is no bar, as it may be
+"""Time of the events for trials of other links: some packets; and of a light that is no bar, which may be
 slow."""
 
-_LIGHTS = 3
-"""Lights that may be one LED, of what blinks."""
+_MAX_LIGHTS = 3
+"""Sources of light that are tried as one LED."""
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What is in a recording, and what becomes of it.
+    """What is in a recording, and why it is read or not.
 
     Attributes:
-        headline: What is wrong first of all, or that nothing is, in one line.
-        checks: What each check found, by stage, in the order in which light passes them.
-        sources: What blinks, most events first.
-        trials: Links that were tried, the one given first.
+        headline: The first fault, or that there is none, in one line.
+        checks: Findings of all checks, by stage, in the order in which light passes them.
+        sources: Sources of light, most events first.
+        trials: Links that were tried, the given one first.
         counts: The receiver's counts.
-        frequency_hz: What each cell of `cell_px` blinks with, NaN where it does not, float64 (rows, columns).
+        frequency_hz: Frequency of each cell of `cell_px`, NaN where it does not blink, float64 (rows,
+            columns).
         events_map: Negative and positive events of each cell, int64 (rows, columns, 2).
         duration_s: From the first event to the last, s.
     """
@@ -99,13 +100,13 @@ def diagnose(
     registry: Registry | None = None,
     advance: Callable[[int, int | None], None] = lambda _done, _of: None,
 ) -> Diagnosis:
-    """Say why a recording is read, or is not: what blinks in it, and which stage of the receiver stops it.
+    """Find out why a recording is read or not: what blinks in it, and which stage of the receiver fails.
 
     Args:
-        source: What to open, plugins asked first; or a source that is open, which is read on and closed.
-        link: The link that it is expected to have been sent with, or a `link.toml`; None for all defaults.
+        source: What to open, plugins asked first; or an open source, which is read on and closed.
+        link: The link that it is expected to be sent with, or a `link.toml`; None for all defaults.
         registry: The plugins; None for all that are installed.
-        advance: Says how far the reading is.
+        advance: Called after each piece with the bytes that are read, and of how many if that is known.
 
     Raises:
         InputError: The source cannot be opened, or read on.
@@ -116,14 +117,14 @@ def diagnose(
     name = str(source.path if isinstance(source, EventSource) else source)
     with source if isinstance(source, EventSource) else open_source(source, registry) as source:
         check_sensor(source, name, link.camera)
-        seen = _Pass(link)
-        for _ in seen.over(source):
+        recording = _RecordingPass(link)
+        for _ in recording.read(source):
             advance(source.position_bytes, source.size_bytes)
-    survey, receiver = seen.survey, seen.receiver
-    sources, frequency_hz = survey.found()
+    survey, receiver = recording.survey, recording.receiver
+    sources, frequency_hz = survey.find_sources()
     facts = Facts(
         link,
-        seen.tally,
+        recording.tally,
         receiver.counts,
         survey.first_us,
         survey.last_us,
@@ -133,23 +134,25 @@ def diagnose(
         guessed=source.guessed,
         step_us=source.step_us,
         reads_messages=link.messages.decode,
-        others=partial(other_codewords, link, registry),
-        surveyed=True,
+        other_codewords=partial(find_other_codewords, link, registry),
+        has_survey=True,
         sources=sources,
-        restless=survey.restless(),
+        restless_box=survey.find_restless_box(),
         speed_px_ms=survey.speed_px_ms(),
     )
-    checks = find_stages(facts)
+    checks = assess_stages(facts)
     trials: tuple[Trial, ...] = ()
-    wrong = any(one.verdict == "fail" or one.code in ("codewords", "unsure") for one in checks)
-    if wrong and not facts.at_edge:
-        sample = seen.sample
-        trials = tuple(_trials(seen, sample, sources, link, registry))
-        inverted = not any(one.fits for one in trials) and try_link(link, _inverted(_short(sample))).fits
-        checks = find_stages(replace(facts, trials=trials, inverted=inverted))
+    is_wrong = any(one.verdict == "fail" or one.code in ("codewords", "unsure") for one in checks)
+    if is_wrong and not facts.touches_edge:
+        sample = recording.sample
+        trials = tuple(_try_links(recording, sample, sources, link, registry))
+        start = _cut_trial_events(sample)
+        inverted = Events(start.t_us, start.x, start.y, 1 - start.p)
+        fits_inverted = not any(one.fits for one in trials) and try_link(link, inverted).fits
+        checks = assess_stages(replace(facts, trials=trials, fits_inverted=fits_inverted))
     return Diagnosis(
         name,
-        _headline(checks, seen.tally),
+        _headline(checks, recording.tally),
         tuple(checks),
         tuple(sources),
         trials,
@@ -162,60 +165,60 @@ def diagnose(
 
 
 def infer_link(source: EventSource, link: Link, registry: Registry | None = None) -> list[Trial]:
-    """Links that may have sent a recording, the best first: what `receive --link auto` takes.
+    """Infer links that may have sent a recording, the best first, as `receive --link auto` does.
 
-    Tried are chip rates of what blinks, modulations, frames per packet and frames per pilot; all else is as
-    given. Where none of these fits, or packets have no preamble, framings say what they take each light for.
+    Tries chip rates of the light, modulations, frames per packet and frames per pilot; all else is as given.
+    Where none of these fits, or packets have no preamble, each framing infers a link from each light.
     Reads the source until some packets have been seen; does not close it.
 
     Raises:
         InputError: The source cannot be read on.
     """
     registry = Registry.load() if registry is None else registry
-    seen = _Pass(link)
-    for _ in seen.over(source):
-        if seen.begun and seen.full:
+    recording = _RecordingPass(link)
+    for _ in recording.read(source):
+        if recording.has_regions and recording.is_full:
             break
-    sources, _ = seen.survey.found()
-    return sorted(_trials(seen, seen.sample, sources, link, registry), key=lambda one: one.rank, reverse=True)
+    sources, _ = recording.survey.find_sources()
+    trials = _try_links(recording, recording.sample, sources, link, registry)
+    return sorted(trials, key=lambda one: one.rank, reverse=True)
 
 
-def _trials(
-    seen: "_Pass", sample: Events, sources: Sequence[LightSource], link: Link, registry: Registry
+def _try_links(
+    recording: "_RecordingPass",
+    sample: Events,
+    sources: Sequence[LightSource],
+    link: Link,
+    registry: Registry,
 ) -> Iterator[Trial]:
-    """What links make of a recording, by a sample of it; the one given first."""
-    short, fits = _short(sample), False
-    # What else a link may be is tried of packets that begin with a preamble only.
-    if "preambles" in seen.receiver.counts and sources:
-        for trial in better_links(link, short, registry, _rates(sources, link)):
+    """Try links on a sample of a recording, the given one first."""
+    start, fits = _cut_trial_events(sample), False
+    # Changes are tried only of links whose packets have a preamble.
+    if "preambles" in recording.receiver.counts and sources:
+        for trial in try_changes(link, start, registry, _candidate_rates_hz(sources, link)):
             yield trial
             fits |= trial.fits
     else:
-        yield try_link(link, short)
+        yield try_link(link, start)
     if len(sample) and not fits:
-        lights = [sample[mask_inside(sample, one.box_px)] for one in sources[:_LIGHTS]]
+        lights = [sample[mask_inside(sample, one.box_px)] for one in sources[:_MAX_LIGHTS]]
         yield from infer_links(link, lights or [sample], registry)
 
 
-def _short(sample: Events) -> Events:
-    """The start of a sample, some packets of a bar."""
+def _cut_trial_events(sample: Events) -> Events:
+    """The start of a sample: some packets of a bar."""
     return sample[: int(np.searchsorted(sample.t_us - sample.t_us[:1], _TRIAL_US))]
 
 
-def _inverted(events: Events) -> Events:
-    """Events with their polarities exchanged."""
-    return Events(events.t_us, events.x, events.y, 1 - events.p)
-
-
-class _Pass:
-    """A recording on its way through a survey and a receiver.
+class _RecordingPass:
+    """One pass of a recording through a survey and a receiver.
 
     Attributes:
-        survey: What blinks.
-        receiver: What the link reads.
+        survey: The survey of its light.
+        receiver: A receiver of the link.
         tally: Figures of its transmitters.
-        pieces: Its first events, or those from where the receiver first finds something.
-        begun: Whether that was so.
+        pieces: Its first events, or those around the receiver's first region.
+        has_regions: The receiver has opened a region.
     """
 
     def __init__(self, link: Link) -> None:
@@ -223,46 +226,46 @@ class _Pass:
         self.receiver = Receiver(link)
         self.tally = RunTally(link.packet)
         self.pieces: list[Events] = []
-        self.begun = False
+        self.has_regions = False
 
-    def over(self, source: EventSource) -> Iterator[None]:
-        """Take a source's events piece by piece."""
+    def read(self, source: EventSource) -> Iterator[None]:
+        """Read a source to its end, piece by piece."""
         for events in source.chunks():
             self.tally.add(*self.receiver.feed(events))
             self.survey.feed(events)
-            if self.receiver.counts["regions_opened"] and not self.begun:
-                # What was found had begun to blink in the piece before.
-                self.begun, self.pieces = True, self.pieces[-1:]
-            if not self.full:
+            if self.receiver.counts["regions_opened"] and not self.has_regions:
+                # A region's light had begun to blink in the piece before.
+                self.has_regions, self.pieces = True, self.pieces[-1:]
+            if not self.is_full:
                 self.pieces.append(events)
             yield
         self.tally.add(*self.receiver.close())
 
     @property
-    def full(self) -> bool:
-        """Whether there are enough first events to try other links on."""
-        long_us = self.pieces[-1].t_us[-1] - self.pieces[0].t_us[0] if self.pieces else 0
-        long_enough_us = _TRIAL_US if self.begun else _LIGHT_US
-        return sum(map(len, self.pieces)) >= MOST_EVENTS or bool(long_us > long_enough_us)
+    def is_full(self) -> bool:
+        """Whether there are enough events for trials of other links."""
+        length_us = self.pieces[-1].t_us[-1] - self.pieces[0].t_us[0] if self.pieces else 0
+        needed_us = _TRIAL_US if self.has_regions else _LIGHT_US
+        return sum(map(len, self.pieces)) >= MAX_EVENTS or bool(length_us > needed_us)
 
     @property
     def sample(self) -> Events:
-        """The events that other links are tried on."""
-        return Events.concat(self.pieces)[:MOST_EVENTS]
+        """The events for trials of other links."""
+        return Events.concat(self.pieces)[:MAX_EVENTS]
 
 
-def _rates(sources: Sequence[LightSource], link: Link) -> list[float]:
-    """Chip rates that what blinks may have, rounded, as people choose them, and not; not the link's own."""
+def _candidate_rates_hz(sources: Sequence[LightSource], link: Link) -> list[float]:
+    """Chip rates that the sources may have, rounded, as people choose them, and not; without the link's."""
     rates: list[float] = []
     own, first = link.packet.chip_rate_hz, sources[0]
-    if first.strength_at(own) > 0.9 * first.strength and abs(first.rate_hz / own - 1) < _RATE_SHARE:
+    if first.strength_at(own) > 0.9 * first.strength and abs(first.rate_hz / own - 1) < _RATE_TOLERANCE:
         return rates
     for source in [one for one in sources if one.kind != "lamp"][:3]:
         rounded = [float(f"{source.rate_hz:.{digits}g}") for digits in (1, 2, 3)]
         for rate in (*rounded, float(f"{2 * source.rate_hz:.3g}")):
-            # None further off than what is measured may be, or half of it.
-            near = any(abs(rate / f - 1) < 0.05 for f in (source.rate_hz, 2 * source.rate_hz))
-            if near and abs(rate / own - 1) > 1e-4 and rate not in rates:
+            # Within the error of the measured rate, or of twice that.
+            is_near = any(abs(rate / f - 1) < 0.05 for f in (source.rate_hz, 2 * source.rate_hz))
+            if is_near and abs(rate / own - 1) > 1e-4 and rate not in rates:
                 rates.append(rate)
     return rates
 
@@ -271,5 +274,5 @@ def _headline(checks: Sequence[Diagnostic], tally: RunTally) -> str:
     for one in checks:
         if one.verdict == "fail":
             return f"{one.stage}: {one.text}"
-    but = next((f"; but {one.text}" for one in checks if one.verdict == "doubt"), "")
-    return f"it is read: {tally.headline()}{but}"
+    warning = next((f"; but {one.text}" for one in checks if one.verdict == "doubt"), "")
+    return f"it is read: {tally.headline()}{warning}"

@@ -27,7 +27,7 @@ def page(diagnosis: Diagnosis) -> str:
     name = Path(diagnosis.recording).name
     height, width = (n * diagnosis.cell_px for n in diagnosis.frequency_hz.shape)
     shown = diagnosis.sources[:_MOST_SOURCES]
-    sources = [(n, *one.cells().values(), f"{one.strength:.2f}") for n, one in enumerate(shown, 1)]
+    sources = [(n, *one.table_cells().values(), f"{one.strength:.2f}") for n, one in enumerate(shown, 1)]
     trials = [
         (
             one.options(),
@@ -49,7 +49,7 @@ def page(diagnosis: Diagnosis) -> str:
         width=width,
         height=height,
         most=_MOST_SOURCES,
-        heads=["", *shown[0].cells(), "certainty"] if shown else [],
+        heads=["", *shown[0].table_cells(), "certainty"] if shown else [],
         sources=sources,
         trials=trials,
     )

@@ -97,7 +97,7 @@ def _character_text(figures: Mapping[str, Any], facts: Facts) -> dict[str, Any]:
     one = facts.tally.transmitters[figures["transmitter"]]
     if not part.link.characters_on_air or one.blocks:
         return {}
-    return {"text": decode_characters(one.firsts)}
+    return {"text": decode_characters(one.first_symbols)}
 
 
 def _describe_link(link: Link) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from evlcp_sdk.diagnosis.facts import Facts, other_codewords
+from evlcp_sdk.diagnosis.facts import Facts, find_other_codewords
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.diagnosis.tallies import PositionTally, RunTally
 from evlcp_sdk.link.resolve import Link
@@ -174,7 +174,7 @@ class ResultWriter:
             tuple(end.losses.values()),
             guessed=str(recording.get("guessed", "")),
             step_us=recording.get("step_us", 0),
-            skipped=(read.get("silences_skipped", 0), read.get("silences_skipped_us", 0)),
+            skipped_silences=(read.get("silences_skipped", 0), read.get("silences_skipped_us", 0)),
             late_events=(end.live or {}).get("shed", {}).get("too_late", 0),
             positions=positions,
         )
@@ -185,7 +185,7 @@ class ResultWriter:
                 tally=self._tally.of_link(name),
                 counts=end.link_counts.get(name, end.counts),
                 reads_messages=messages_off_reason(link) is None,
-                others=partial(other_codewords, link, self._registry),
+                other_codewords=partial(find_other_codewords, link, self._registry),
                 positions=positions if name == self._placing else {},
             )
             for name, link in self._links.items()

@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 from numpy.typing import NDArray
 
 from evlcp_sdk.diagnosis.checks import run_checks
-from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, other_codewords
+from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, find_other_codewords
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.diagnosis.tallies import PositionTally, RunTally
 from evlcp_sdk.link.resolve import load_link
@@ -213,7 +213,7 @@ def test_a_bent_image(off_px: dict[int, float], message: str) -> None:
     found = find(Facts(LINK, tally, {}))
     assert [(doubt.code, message in doubt.text) for doubt in found] == [("image-bent", True)] * bool(message)
     # In a few of its frames.
-    tally.transmitters[0].bent = 9
+    tally.transmitters[0].distorted_frames = 9
     assert not find(Facts(LINK, tally, {}))
 
 
@@ -224,9 +224,9 @@ def test_the_modulation_that_was_sent() -> None:
     inside = np.array([i for i, word in enumerate(ours) if word in theirs])
     assert len(inside) == 16
     sent = inside[np.random.default_rng(2).integers(0, 16, (6, 10, 16))]
-    others = partial(other_codewords, LINK, Registry.load())
+    others = partial(find_other_codewords, LINK, Registry.load())
     counts = {"blocks_tried": 9, "blocks_failed": 9}
-    (doubt,) = find(Facts(LINK, tally_of(sent), counts, others=others))
+    (doubt,) = find(Facts(LINK, tally_of(sent), counts, other_codewords=others))
     assert (doubt.code, doubt.transmitter) == ("profile", 0)
     assert doubt.text == "only 16 of 64 symbols ever occur, 9 of 9 blocks unreadable"
     assert doubt.next_step == "was this sent with wh8? try --set modulation.id=wh8"
@@ -235,7 +235,7 @@ def test_the_modulation_that_was_sent() -> None:
     mixed = np.concatenate([inside, rest])[np.random.default_rng(2).integers(0, 32, (6, 10, 16))]
     # Or all the same, which every modulation has.
     for symbols in (mixed, sent * 0):
-        (doubt,) = find(Facts(LINK, tally_of(symbols), {}, others=others))
+        (doubt,) = find(Facts(LINK, tally_of(symbols), {}, other_codewords=others))
         assert doubt.code == "codewords"
 
 
@@ -289,7 +289,7 @@ def test_events_of_each_millisecond(steps: list[int], pieces: int) -> None:
     """Against NumPy's count of the milliseconds that are over."""
     t_us = np.cumsum(steps) * 7
     many = np.unique(t_us // 1000, return_counts=True)[1][:-1]
-    share, most = readout_of(t_us, 0, pieces).events.capped()
+    share, most = readout_of(t_us, 0, pieces).events.measure_cap()
     assert most == pytest.approx(many.max(initial=0), rel=0.004)
     if most < 100:
         assert share == pytest.approx((many == many.max()).mean() if len(many) else 0.0)

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from evlcp_sdk.cli._app import make_app
 from evlcp_sdk.diagnosis import _kernels
-from evlcp_sdk.diagnosis.checks import find_stages
+from evlcp_sdk.diagnosis.checks import assess_stages
 from evlcp_sdk.diagnosis.diagnose import Diagnosis, diagnose, infer_link
 from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.diagnosis.light import LightSource, LightSurvey
@@ -129,15 +129,15 @@ def first_failure(*sources: LightSource, quality=1.0, frames=0, rejected=0, dura
     if frames:
         one = tally.transmitters[0] = TransmitterTally(10, 34_600.0)
         one.frames, one.quality_sum, one.first_frame, one.last_frame = frames, quality * frames, 0, frames - 1
-        one.values.update(range(64))
-        one.ranged = frames
-        one.passed_px = 410.0, 375.0, 410.0, 375.0
+        one.symbol_counts.update(range(64))
+        one.ranged_frames = frames
+        one.path_box_px = 410.0, 375.0, 410.0, 375.0
     counts = dict.fromkeys(("preambles", "regions_opened"), 3)
     counts |= {"frames": frames, "frames_rejected": rejected}
     counts["events"], lost = 10**6, 2000
     losses = [Loss(lost, 0, "byte", "odd words")]
-    facts = Facts(LINK, tally, counts, 0.0, duration_us, losses=losses, surveyed=True, sources=sources)
-    dropped, *wrong = [one for one in find_stages(facts) if one.verdict in ("fail", "doubt")]
+    facts = Facts(LINK, tally, counts, 0.0, duration_us, losses=losses, has_survey=True, sources=sources)
+    dropped, *wrong = [one for one in assess_stages(facts) if one.verdict in ("fail", "doubt")]
     # What is lost of a recording stops no light.
     assert (dropped.code, dropped.verdict) == ("dropped", "doubt")
     assert all(one.next_step for one in wrong)
@@ -241,8 +241,8 @@ def test_light_that_sweeps_is_not_reported_to_be_weak(speed_px_ms: float, messag
         survey.feed(Events.of(t_us, np.rint(x).astype(int), rng.integers(300, 420, t_us.size), t_us % 2))
     assert survey.speed_px_ms() == pytest.approx(speed_px_ms, abs=0.05)
     link = load_link()
-    facts = Facts(link, RunTally(link.packet), {"events": 200_000}, surveyed=True, speed_px_ms=speed_px_ms)
-    light = next(one for one in find_stages(facts) if one.stage == "light")
+    facts = Facts(link, RunTally(link.packet), {"events": 200_000}, has_survey=True, speed_px_ms=speed_px_ms)
+    light = next(one for one in assess_stages(facts) if one.stage == "light")
     assert (light.verdict, light.code) == ("fail", "motion" if message else "dark")
     assert message in light.text
 
@@ -253,7 +253,7 @@ def test_a_lamp_that_is_followed_is_one_at_any_rate(rate_hz: float, late: float)
     """Each rise late by a share of a period, one in twenty missed."""
     rng = np.random.default_rng(1)
     at = np.cumsum(rng.geometric(0.95, (64, 101)), 1) + rng.normal(0, late, (64, 101))
-    (lamp,), _ = survey_of(np.diff(at, axis=1) * 1e6 / rate_hz).found()
+    (lamp,), _ = survey_of(np.diff(at, axis=1) * 1e6 / rate_hz).find_sources()
     assert lamp.kind == "lamp"
     assert lamp.rate_hz == pytest.approx(rate_hz, rel=0.02 if late < 0.05 else 0.17)
 
@@ -262,7 +262,7 @@ def test_rare_rises_of_a_dim_code_are_no_lamps() -> None:
     """Four chips apart and more, late by a third of a chip: the hump of their times is no period."""
     rng = np.random.default_rng(1)
     chips = 3 + rng.geometric(0.5, (64, 100)) + rng.normal(0, 0.3, (64, 100))
-    sources, _ = survey_of(chips * 100.0).found()
+    sources, _ = survey_of(chips * 100.0).find_sources()
     assert sources
     assert all(source.kind == "unclear" for source in sources)
 
@@ -353,7 +353,7 @@ def count_twin(events: Events, shape: tuple[int, int], shift: int, calm_us: int)
             if gap < fine * _kernels.SHORT:
                 gaps[cell][gap // fine] += 1
             signs[cell][p] += 1
-            if p and since >= _kernels.SOONEST_US and (before == 0 or gap > calm_us):
+            if p and since >= _kernels.MIN_RISE_US and (before == 0 or gap > calm_us):
                 if since < wide:
                     intervals[cell][since // fine] += 1
                 elif since < wide + coarse * _kernels.COARSE:

@@ -176,7 +176,7 @@ def test_the_median_needs_no_memory_of_every_frame() -> None:
         tally.add(packet(i // 3, *(frame(i // 3, k, float(distances[i + k])) for k in range(3))))
     assert tally.median_m() == pytest.approx(np.median(distances), abs=0.006)
     tally.add(packet(333, frame(333, 0, 1e300)))
-    assert max(tally.cells) == 100_000
+    assert max(tally.distance_cells) == 100_000
 
 
 def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path) -> None:

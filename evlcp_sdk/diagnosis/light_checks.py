@@ -1,4 +1,4 @@
-"""Checks of a recording and of the light in it, from its events to the preamble; most ask for a survey."""
+"""Checks of a recording and of the light in it, from its events to the preamble; most need a survey."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from evlcp_sdk.clock import TimeGrain
-from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Found, has_rate, in_ms
+from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Findings, format_ms, has_rate
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import find_ambiguous_links
 from evlcp_sdk.suggestions import format_count
@@ -16,84 +16,85 @@ from evlcp_sdk.suggestions import format_count
 if TYPE_CHECKING:
     from evlcp_sdk.diagnosis.light import LightSource
 
-_DROPPED_SHARE, _DROPPED_LEAST = 0.001, 100
-"""Of the events: dropped ones of which more is said. A restart of the camera costs fewer."""
+_DROPPED_SHARE, _MIN_DROPPED = 0.001, 100
+"""Dropped events that are reported, by share and number. A restart of the camera costs fewer."""
 
-_NO_ROOM = (
+_ROOM_COUNTS = (
     ("dropped_crowded", "{} event{} of crowded time steps dropped"),
     ("dropped_no_room", "{} event{} of regions forgotten early"),
     ("frames_cut", "{} frame{} passed over for it"),
     ("regions_left_out", "{} time{} a region more was not followed"),
     ("regions_gave_way", "{} region{} without a bar let go for others"),
 )
-"""Counts of what there was no room for, and how they are stated."""
+"""Counts of what was dropped for lack of room, and their texts."""
 
-_COVERED = 0.5
-"""Share of a recording of which no more is without frames unless it is said."""
+_COVERED_SHARE = 0.5
+"""Share of a recording with frames below which the gaps are reported."""
 
 _FEW_NEGATIVE = 0.1
-"""Share of negative events below which they are missing: as much light goes as comes."""
+"""Share of negative events below which some are missing: light goes off as often as on."""
 
 _ONE_SIGN_SHARE, _ONE_SIGN_EVENTS = 0.02, 100
-"""Where nobody surveyed the light: events of the rarer sign, by their share of all, below which nothing is
-known of one half of the edges, and events from which on it is said. A light that goes on goes off again:
-cameras whose thresholds are unlike still give a tenth; noise alone may give a few of either."""
+"""Without a survey: share of the rarer sign below which one kind of edges is missing, and events that are
+needed. A light that goes on goes off again: cameras of unequal thresholds still give a tenth; noise alone may
+give a few of either."""
 
 _BLIND_CHIPS = 1.1
-"""Time from event to event of a pixel, in chips, above which edges one chip apart are lost."""
+"""Time between events of a pixel, in chips, above which edges one chip apart are lost."""
 
-_SMALLEST_PX, _SMALL_PX = 1.5, 2.5
-"""Pixels a cluster below which clusters cannot be told apart, and below which errors are to be expected: two
-sampled points a cluster are the least, and the pixels between two clusters show both."""
+_UNREADABLE_PX, _SMALL_PX = 1.5, 2.5
+"""Pixels a cluster below which clusters cannot be separated, and below which errors are to be expected: two
+samples a cluster are the least, and the pixels between two clusters show both."""
 
 _SMEARED_CLUSTERS, _SHARP_PX = 2.0, 5.0
-"""Width of a source, in clusters, above which the light of each covers its neighbours on both sides, and up
-to how many px wide a column of LEDs in focus may look."""
+"""Width of a source, in clusters, above which the light of each covers its neighbours on both sides; and the
+largest width of a column of LEDs in focus."""
 
 _RARE_CHIPS, _WEAK = 5.0, 0.35
-"""Median time between rises, in chips, and mean of the comb, beyond both of which light is too weak: a code
-rises every 2.7 chips, and jitter of 20 us leaves .45 of the mean at 10 kHz."""
+"""Median time between rises, in chips, above which, and strength, below which, light is too weak: a code
+rises every 2.7 chips, and jitter of 20 us leaves .45 of the strength at 10 kHz."""
 
 _ROW_US, _SLOW_SHARE = 0.2, 0.7
-"""What an IMX636 takes to read a row, by its latency against the lit area, and the share of a chip above
-which reading a bar's rows, one after another, mixes its edges with the next chip's."""
+"""Time in which an IMX636 reads a row, by its latency against the lit area; and share of a chip above which
+reading a bar's rows, one after another, mixes its edges with the next chip's."""
 
-_MIN_RISES, _LEAST_RATE, _SLENDER = 500, 0.25, 4.0
-"""Of light that is not read beside a bar that is: rises; the least share of the link's rate that it has; how
-many times longer than wide it is. Leaves and edges that pass look like a code of some hundred chips a second,
-a lamp whose periods are missed like one of some thousand."""
+_MIN_RISES, _MIN_RATE_SHARE, _MIN_ASPECT = 500, 0.25, 4.0
+"""Least rises, share of the link's rate and ratio of length to width of an unread bar. Passing leaves and
+edges look like a code of some hundred chips a second, a lamp with missed periods like one of some
+thousand."""
 
 _ROUND_CHIPS = 0.75
-"""Chips between two readings of a row from which on events of one edge, which come within 25 us, are read
-together with those of the next: at 17 m a bar is read without fault at .7."""
+"""Chips between two readings of a row from which on events of two edges, each of which takes 25 us, are read
+together: at 17 m a bar is read without errors at .7."""
 
 _GLOW_PX = 32
-"""Gap up to which light beside a bar is its own."""
+"""Gap up to which light beside a bar is its glow."""
 
-_SOME = 0.02
-"""Share of all events below which what blinks is not worth a word where nothing sends chips."""
+_MIN_EVENT_SHARE = 0.02
+"""Share of all events below which a source that sends no chips is not reported."""
 
 _BLURRED_SHARE = 0.2
-"""Width of what flickers, as a share of its length, above which its light is too weak for being spread."""
+"""Ratio of width to length above which a flickering source is defocused."""
 
-_SAME_RATE = 0.03
-"""How far two rates may be apart and be one."""
+_RATE_TOLERANCE = 0.03
+"""Relative difference of two equal rates."""
 
 _MANY_EVENTS = 100_000
-"""In regions without a preamble, of which more is said: a bar sends so many in 20 ms, a lamp in a second."""
+"""In regions without a preamble, above which it is reported: a bar sends so many in 20 ms, a lamp in a
+second."""
 
 _SHARPER = "focus the lens, clean it and the window; a smaller aperture is sharper"
 
 
-def check_events(facts: Facts) -> Found:
-    """What there is, and what of it did not count for other reasons than room."""
+def check_events(facts: Facts) -> Findings:
+    """The number of events, and of those dropped for other reasons than room."""
     events = facts.counts.get("events", 0)
     losses = f"; lost: {'; '.join(map(str, facts.losses))}" if facts.losses else ""
-    no_room = [name for name, _ in _NO_ROOM]
+    no_room = [name for name, _ in _ROOM_COUNTS]
     dropped = {n: k for n, k in facts.counts.items() if n.startswith("dropped_") and k and n not in no_room}
     lost = sum(loss.count for loss in facts.losses)
     number = sum(dropped.values()) + lost
-    if number >= _DROPPED_LEAST and number > _DROPPED_SHARE * (events + lost):
+    if number >= _MIN_DROPPED and number > _DROPPED_SHARE * (events + lost):
         kinds = [f"{k} {n.removeprefix('dropped_').replace('_', ' ')}" for n, k in dropped.items()]
         kinds += [f"{lost} in the file"] * (lost > 0)
         step = "losses and counts in summary.json say where and why, `evlcp info` what is in the recording"
@@ -107,8 +108,8 @@ def check_events(facts: Facts) -> Found:
         yield Diagnostic("empty", f"no events{losses}", step, verdict="fail")
 
 
-def check_times(facts: Facts) -> Found:
-    """Times in steps of more than a quarter of a chip, of which little is left; or guessed ones."""
+def check_times(facts: Facts) -> Findings:
+    """Times in steps of more than a quarter of a chip, and guessed properties."""
     chip_us = min(one.link.packet.chip_us for one in (facts, *facts.parts.values()))
     grain = facts.readout.grain if facts.readout is not None else TimeGrain()
     step_us = max(facts.step_us, grain.step_us if grain.known_us is not None else 0)
@@ -121,23 +122,24 @@ def check_times(facts: Facts) -> Found:
     if facts.guessed:
         step = "where that is wrong, name the file with its unit and columns: list:PATH?unit=us&columns=t,p"
         yield Diagnostic("guessed", facts.guessed, step, verdict="note")
-    silences, silent_us = facts.skipped
+    silences, silent_us = facts.skipped_silences
     if silences:
         text = f"{format_count(silences, 'silence')} of {silent_us * 1e-6:.1f} s in all"
         text += ", where the recording is damaged, not waited for"
         yield Diagnostic("pace", text, verdict="note")
 
 
-def check_room(facts: Facts) -> Found:
-    """What the receiver had no room for."""
-    found = [text.format(n, "s" * (n != 1)) for name, text in _NO_ROOM if (n := facts.counts.get(name, 0))]
-    if found:
-        text = f"more than the receiver holds at a time: {'; '.join(found)}; frames may be missing"
+def check_room(facts: Facts) -> Findings:
+    """What the receiver dropped for lack of room."""
+    counts = ((facts.counts.get(name, 0), text) for name, text in _ROOM_COUNTS)
+    dropped = [text.format(n, "s" * (n != 1)) for n, text in counts if n]
+    if dropped:
+        text = f"more than the receiver holds at a time: {'; '.join(dropped)}; frames may be missing"
         yield Diagnostic("no-room", text)
 
 
 def find_alike_links(links: Mapping[str, Link]) -> Iterator[Diagnostic]:
-    """Links of which nothing on air tells one from the other, by name: known before anything is read."""
+    """Links that nothing on air distinguishes; known before anything is read."""
     for one, other in find_ambiguous_links(links):
         yield Diagnostic(
             "alike-links",
@@ -147,17 +149,17 @@ def find_alike_links(links: Mapping[str, Link]) -> Iterator[Diagnostic]:
         )
 
 
-def check_links(facts: Facts) -> Found:
-    """Links that the receiver cannot tell apart."""
+def check_links(facts: Facts) -> Findings:
+    """Links that the receiver cannot distinguish."""
     yield from find_alike_links({name: part.link for name, part in facts.parts.items()})
 
 
-def check_readout(facts: Facts) -> Found:
+def check_readout(facts: Facts) -> Findings:
     """A readout that is at its limit."""
     if facts.readout is None:
         return
     events, (row_us, round_us) = facts.readout.events, facts.readout.round_us()
-    share, peak = events.capped()
+    share, peak = events.measure_cap()
     chip_us = min(one.link.packet.chip_us for one in (facts, *facts.parts.values()))
     if round_us > _ROUND_CHIPS * chip_us:
         yield Diagnostic(
@@ -178,24 +180,26 @@ def check_readout(facts: Facts) -> Found:
         yield f"at most {peak / 1e3:.3g} Mev/s, not at a limit"
 
 
-def check_light(facts: Facts) -> Found:
-    """What blinks: a bar, lamps alone, or nothing that is worth a word; and a bar more that is not read."""
-    if not facts.surveyed:
+def check_light(facts: Facts) -> Findings:
+    """The sources of light: a bar, lamps alone, or none; and another bar that is not read."""
+    if not facts.has_survey:
         return
-    if not facts.reads and facts.better is not None and facts.better.said:
-        yield Diagnostic("link", facts.better.said, facts.better.options())
+    if not facts.is_read and facts.better_trial is not None and facts.better_trial.explanation:
+        yield Diagnostic("link", facts.better_trial.explanation, facts.better_trial.options())
         return
-    yield from (Diagnostic("", one.said, verdict="note") for one in facts.trials if one.said)
-    if facts.reads or (facts.bar is not None and not _is_lamp(facts.bar, facts)):
-        yield (facts.reads and _find_unread(facts)) or _describe_sources(facts)
+    yield from (Diagnostic("", one.explanation, verdict="note") for one in facts.trials if one.explanation)
+    if facts.is_read or (facts.bar is not None and not _is_lamp(facts.bar, facts)):
+        yield (facts.is_read and _find_unread(facts)) or _describe_sources(facts)
         return
     if facts.speed_px_ms:
         step = "turn more slowly, or a shorter lens: up to 8 px/ms a bar is followed"
-        yield Diagnostic("motion", f"what shines {_sweeps(facts)}: hardly anything is read of it", step)
+        yield Diagnostic(
+            "motion", f"what shines {_describe_sweep(facts)}: hardly anything is read of it", step
+        )
         return
     lamps = [one for one in facts.sources if one.kind == "lamp"]
     if lamps:
-        rates = ", ".join([_hz(one.rate_hz) for one in lamps[:4]] + ["..."] * (len(lamps) > 4))
+        rates = ", ".join([_format_rate(one.rate_hz) for one in lamps[:4]] + ["..."] * (len(lamps) > 4))
         yield Diagnostic(
             "lamp",
             f"{format_count(len(lamps), 'lamp')} blinking ({rates}), nothing sends chips",
@@ -203,8 +207,8 @@ def check_light(facts: Facts) -> Found:
         )
         return
     first = facts.sources[0] if facts.sources else None
-    if first is None or (first.kind != "code" and first.events < _SOME * facts.counts["events"]):
-        yield _without_rhythm(facts)
+    if first is None or (first.kind != "code" and first.events < _MIN_EVENT_SHARE * facts.counts["events"]):
+        yield _describe_flicker(facts)
         return
     text = f"{_describe_sources(facts)}, but too rarely to recognise a code"
     long_px, wide_px = max(first.wide_px, first.high_px), min(first.wide_px, first.high_px)
@@ -216,17 +220,17 @@ def check_light(facts: Facts) -> Found:
 
 
 def _find_unread(facts: Facts) -> Diagnostic | None:
-    """Light of a code where no frame is read, beside one that is; None where there is none."""
+    """A source of a code without frames, beside one with frames; None where there is none."""
     link_hz = facts.link.packet.chip_rate_hz
-    places = [one.passed_px for one in facts.tally.transmitters.values()]
+    places = [one.path_box_px for one in facts.tally.transmitters.values()]
     read = [one.box_px for one in facts.sources if any(_gap_px(one.box_px, at) <= 0 for at in places)]
     for source in facts.sources:
-        same = has_rate(source, link_hz)
+        same_rate = has_rate(source, link_hz)
         long_px, wide_px = sorted((source.wide_px, source.high_px), reverse=True)
-        likely = source.rate_hz >= _LEAST_RATE * link_hz and long_px >= _SLENDER * wide_px
-        if source.kind != "code" or source.rises < _MIN_RISES or not (same or likely):
+        likely = source.rate_hz >= _MIN_RATE_SHARE * link_hz and long_px >= _MIN_ASPECT * wide_px
+        if source.kind != "code" or source.rises < _MIN_RISES or not (same_rate or likely):
             continue
-        # A bar's own glow may stand a little apart, and is left where it has been.
+        # A bar's glow may be a little apart, and stays where the bar has been.
         if any(_gap_px(source.box_px, other) < _GLOW_PX for other in (*read, *places)):
             continue
         left, top, right, bottom = source.box_px
@@ -235,31 +239,31 @@ def _find_unread(facts: Facts) -> Diagnostic | None:
         return Diagnostic(
             "unread",
             f"{_describe_sources(facts)}; no frame is read of the one in columns {left} to {right}, rows"
-            f" {top} to {bottom}, {_hz(link_hz if same else source.rate_hz)}",
-            f"another bar? {BRIGHTER}" if same else f"{other}; or light that is too weak for its chips",
+            f" {top} to {bottom}, {_format_rate(link_hz if same_rate else source.rate_hz)}",
+            f"another bar? {BRIGHTER}" if same_rate else f"{other}; or light that is too weak for its chips",
         )
     return None
 
 
 def _gap_px(one: tuple[float, ...], other: tuple[float, ...]) -> float:
-    """How far two boxes (left, top, right, bottom) are apart, across or down; 0 or less where they meet."""
+    """Gap between two boxes (left, top, right, bottom), across or down; 0 or less where they meet."""
     return max(one[0] - other[2], other[0] - one[2], one[1] - other[3], other[1] - one[3])
 
 
 def _is_lamp(source: LightSource, facts: Facts) -> bool:
-    """Whether a source is rather the light of a lamp, with periods missing, than a bar of another rate."""
+    """Whether a source is a lamp with missing periods rather than a bar of another rate."""
     same_rate = has_rate(source, facts.link.packet.chip_rate_hz)
-    if facts.some_frames or same_rate or facts.better is not None:
+    if facts.has_frames or same_rate or facts.better_trial is not None:
         return False
     lamps = [one.rate_hz for one in facts.sources if one.kind == "lamp"]
-    same = (abs(times * source.rate_hz / rate - 1) < _SAME_RATE for rate in lamps for times in (0.5, 1, 2))
-    return facts.sources[0].kind == "lamp" or any(same)
+    harmonics = [factor * source.rate_hz for factor in (0.5, 1, 2)]
+    same = any(abs(harmonic / rate - 1) < _RATE_TOLERANCE for rate in lamps for harmonic in harmonics)
+    return same or facts.sources[0].kind == "lamp"
 
 
-def _without_rhythm(facts: Facts) -> Diagnostic:
-    """What is found where nothing blinks that is worth a word."""
-    if facts.restless is not None:
-        left, top, right, bottom = facts.restless
+def _describe_flicker(facts: Facts) -> Diagnostic:
+    if facts.restless_box is not None:
+        left, top, right, bottom = facts.restless_box
         return Diagnostic(
             "dim",
             f"something flickers in columns {left} to {right}, rows {top} to {bottom}, without any rhythm:"
@@ -274,18 +278,18 @@ def _without_rhythm(facts: Facts) -> Diagnostic:
     )
 
 
-def check_edges(facts: Facts) -> Found:
+def check_edges(facts: Facts) -> Findings:
     """Light of which one kind of edges is hardly seen."""
     counts, bar = facts.counts, facts.bar
     if bar is not None:
-        events, on, least = bar.events, round((1 - bar.negative_share) * bar.events), _FEW_NEGATIVE
+        events, on, min_share = bar.events, round((1 - bar.negative_share) * bar.events), _FEW_NEGATIVE
     elif counts.get("frames", 0) and "events_in_regions_on" in counts:
-        events, on, least = counts["events_in_regions"], counts["events_in_regions_on"], _ONE_SIGN_SHARE
+        events, on, min_share = counts["events_in_regions"], counts["events_in_regions_on"], _ONE_SIGN_SHARE
         if events < _ONE_SIGN_EVENTS:
             return
     else:
         return
-    if min(on, events - on) < least * events:
+    if min(on, events - on) < min_share * events:
         sign, other = ("ON", "off") if 2 * on > events else ("OFF", "on")
         yield Diagnostic(
             "one-polarity",
@@ -296,7 +300,7 @@ def check_edges(facts: Facts) -> Found:
         yield f"{1 - on / events:.0%} of the bar's events are negative"
 
 
-def check_pixels(facts: Facts, bar: LightSource) -> Found:
+def check_pixels(facts: Facts, bar: LightSource) -> Findings:
     """Pixels that are blind for longer than a chip."""
     blind_us = bar.blind_us
     chips = blind_us / facts.link.packet.chip_us
@@ -311,18 +315,18 @@ def check_pixels(facts: Facts, bar: LightSource) -> Found:
         yield f"pixels answer again within {blind_us:.0f} us" if blind_us else "pixels answer at once"
 
 
-def check_size(facts: Facts, bar: LightSource) -> Found:
-    """A bar that is too small in the picture, or of more rows than are read in a chip."""
+def check_size(facts: Facts, bar: LightSource) -> Findings:
+    """A bar that is too small in the picture, or too high for the readout."""
     (px, steps), chip_us = _measure_clusters(facts, bar), facts.link.packet.chip_us
     if not px > 0:
         return
     text = f"{px:.1f} px a cluster"
     rows_us = bar.high_px * _ROW_US
-    if px < (_SMALL_PX if facts.reads else _SMALLEST_PX):
-        far_m = facts.link.camera.focal_px * facts.link.bar.length_m / (px * (steps + 1))
-        step = "nearer, or a longer lens" + ("" if facts.reads else " (or fewer, larger clusters)")
-        yield Diagnostic("far", f"{text}, as of a bar {far_m:.0f} m away", step)
-    elif rows_us >= _SLOW_SHARE * chip_us and not facts.sure and facts.better is None:
+    if px < (_SMALL_PX if facts.is_read else _UNREADABLE_PX):
+        distance_m = facts.link.camera.focal_px * facts.link.bar.length_m / (px * (steps + 1))
+        step = "nearer, or a longer lens" + ("" if facts.is_read else " (or fewer, larger clusters)")
+        yield Diagnostic("far", f"{text}, as of a bar {distance_m:.0f} m away", step)
+    elif rows_us >= _SLOW_SHARE * chip_us and not facts.is_certain and facts.better_trial is None:
         yield Diagnostic(
             "near",
             f"{bar.high_px:.0f} rows high: a sensor that reads a row in {_ROW_US:g} us takes {rows_us:.0f} us"
@@ -334,14 +338,14 @@ def check_size(facts: Facts, bar: LightSource) -> Found:
         yield text
 
 
-def check_focus(facts: Facts, bar: LightSource) -> Found:
-    """Clusters that cover one another."""
+def check_focus(facts: Facts, bar: LightSource) -> Findings:
+    """Clusters whose light overlaps."""
     px, _ = _measure_clusters(facts, bar)
     if not px > 0:
         return
     across_px = min(bar.wide_px, bar.high_px)
     text = f"{across_px:.0f} px across, {px:.1f} px a cluster along it"
-    if not facts.sure and across_px > max(_SMEARED_CLUSTERS * px, _SHARP_PX):
+    if not facts.is_certain and across_px > max(_SMEARED_CLUSTERS * px, _SHARP_PX):
         yield Diagnostic(
             "defocus",
             f"{text}: the light of each cluster covers its neighbours, or the layout is another one",
@@ -353,100 +357,104 @@ def check_focus(facts: Facts, bar: LightSource) -> Found:
 
 
 def _measure_clusters(facts: Facts, bar: LightSource) -> tuple[float, float]:
-    """From cluster to cluster, px, by frames that are read or else by the source; steps from end to end."""
+    """Spacing of the clusters, px, by frames or else by the source; and spacings from end to end."""
     centres_m, steps = facts.link.bar.cluster_centres_m(), 1.0
     if len(centres_m) > 1:
         step_m = min(math.dist(centres_m[0], other) for other in centres_m[1:])
         steps = math.dist(centres_m[0], centres_m[-1]) / step_m
-    one = max(facts.tally.own, key=lambda tally: tally.sized, default=None)
-    if one is not None and one.sized:
-        return math.hypot(*one.along_px) / one.sized / steps, steps
-    # A source shows the clusters at the ends whole.
+    one = max(facts.tally.non_reflections, key=lambda tally: tally.sized_frames, default=None)
+    if one is not None and one.sized_frames:
+        return math.hypot(*one.along_px) / one.sized_frames / steps, steps
+    # A source includes the whole clusters at the ends.
     return max(bar.wide_px, bar.high_px) / (steps + 1), steps
 
 
-def check_brightness(facts: Facts, bar: LightSource) -> Found:
+def check_brightness(facts: Facts, bar: LightSource) -> Findings:
     """Light that is too weak for its chips."""
     chips = bar.typical_us / facts.link.packet.chip_us
     text = f"a pixel of it rises every {chips:.1f} chips"
-    if not facts.reads and chips > _RARE_CHIPS and bar.strength < _WEAK:
+    if not facts.is_read and chips > _RARE_CHIPS and bar.strength < _WEAK:
         yield Diagnostic("dim", f"{text}, and late by many microseconds: it is too weak", BRIGHTER)
     else:
         yield text
 
 
-def check_rate(facts: Facts, bar: LightSource) -> Found:
+def check_rate(facts: Facts, bar: LightSource) -> Findings:
     """Light of another rate than the link's."""
     link_hz = facts.link.packet.chip_rate_hz
-    better = facts.better_value("air.chip_rate_hz")
-    if not facts.reads and (better is not None or not has_rate(bar, link_hz)):
-        rate_hz = bar.rate_hz if better is None else better
+    better_hz = facts.better_value("air.chip_rate_hz")
+    if not facts.is_read and (better_hz is not None or not has_rate(bar, link_hz)):
+        rate_hz = bar.rate_hz if better_hz is None else better_hz
         step = f"--set air.chip_rate_hz={rate_hz:g}"
-        step += ", or the rate that it is sent with" if better is None else ""
-        yield Diagnostic("rate", f"blinks at {_hz(rate_hz)}, the link says {_hz(link_hz)}", step)
+        step += ", or the rate that it is sent with" if better_hz is None else ""
+        yield Diagnostic(
+            "rate", f"blinks at {_format_rate(rate_hz)}, the link says {_format_rate(link_hz)}", step
+        )
     else:
-        yield f"{_hz(link_hz)}, as the link says"
+        yield f"{_format_rate(link_hz)}, as the link says"
 
 
-def check_preamble(facts: Facts) -> Found:
-    """Something that blinks, and of which nothing is read."""
+def check_preamble(facts: Facts) -> Findings:
+    """Blinking light of which nothing is read."""
     counts, packet = facts.counts, facts.link.packet
-    if facts.surveyed and not facts.reads and facts.duration_us < 2 * packet.packet_us:
+    if facts.has_survey and not facts.is_read and facts.duration_us < 2 * packet.packet_us:
         yield Diagnostic(
             "short",
             f"the recording lasts {facts.duration_us / 1e3:.1f} ms, a packet {packet.packet_us / 1e3:.1f} ms",
             "record some packets: the next preamble may come after the end",
         )
-    looked_for = "preambles" in counts
+    has_preamble = "preambles" in counts
     found, regions = counts.get("preambles", counts.get("frames", 0)), counts.get("regions_opened", 0)
     blinking = counts.get("events_in_regions", 0)
-    if not found and (blinking >= _MANY_EVENTS or (facts.surveyed and looked_for)):
+    if not found and (blinking >= _MANY_EVENTS or (facts.has_survey and has_preamble)):
         code, what, compare = "no-frames", "frame is read", "[framing] with the transmitter's"
-        if looked_for:
+        if has_preamble:
             code, what = "no-preamble", "preamble is detected"
             compare = "[pilots] with the transmitter's; a panel or leaves behind a bar may mask it"
-        ask = "" if facts.surveyed else "; `evlcp diagnose` says what blinks, and how fast"
+        ask = "" if facts.has_survey else "; `evlcp diagnose` says what blinks, and how fast"
         yield Diagnostic(
             code,
             f"something blinks, {format_count(blinking, 'event')} in {format_count(regions, 'region')},"
             f" but no {what}",
             f"compare air.chip_rate_hz and {compare}{ask}",
         )
-    elif looked_for:
+    elif has_preamble:
         yield f"{found} detected in {format_count(regions, 'region')}"
     else:
         yield Diagnostic("preamble", "not looked for: the link's framing has none", verdict="skip")
 
 
-def check_coverage(facts: Facts) -> Found:
-    """Links, and most of a recording, without a frame: none of these is a fault of its own."""
+def check_coverage(facts: Facts) -> Findings:
+    """Links without a frame, and long gaps in a recording: neither is a fault by itself."""
     for name, part in (facts.parts or {"": facts}).items():
-        if not part.tally.transmitters and facts.counts.get("events", 0) and not facts.surveyed:
+        if not part.tally.transmitters and facts.counts.get("events", 0) and not facts.has_survey:
             step = "`evlcp diagnose` says what blinks, and what to try"
             yield Diagnostic("nothing-found", "no frame was read", step, link=name, verdict="note")
     tallies, covered_us = facts.tally.transmitters.values(), facts.tally.covered_us
-    if tallies and covered_us < (1 - _COVERED) * facts.duration_us:
+    if tallies and covered_us < (1 - _COVERED_SHARE) * facts.duration_us:
         before, after = min(one.first_us for one in tallies), max(one.last_us for one in tallies)
         text = (
-            f"frames in {in_ms(covered_us)} of {in_ms(facts.duration_us)}: nothing before"
-            f" {in_ms(before - facts.first_us)}, nothing after {in_ms(after - facts.first_us)}"
+            f"frames in {format_ms(covered_us)} of {format_ms(facts.duration_us)}: nothing before"
+            f" {format_ms(before - facts.first_us)}, nothing after {format_ms(after - facts.first_us)}"
         )
         yield Diagnostic("coverage", text, verdict="note")
 
 
 def _describe_sources(facts: Facts) -> str:
-    many = Counter[str](one.kind for one in facts.sources)
+    numbers = Counter[str](one.kind for one in facts.sources)
     names = {"code": "source", "lamp": "lamp", "unclear": "unclear source"}
     words = [
-        format_count(many[k], name) + " of chips" * (k == "code") for k, name in names.items() if many[k]
+        format_count(numbers[k], name) + " of chips" * (k == "code")
+        for k, name in names.items()
+        if numbers[k]
     ]
     text = ", ".join(words) or "no source of its own"
-    return f"{text}; what shines {_sweeps(facts)}" if facts.speed_px_ms else text
+    return f"{text}; what shines {_describe_sweep(facts)}" if facts.speed_px_ms else text
 
 
-def _sweeps(facts: Facts) -> str:
+def _describe_sweep(facts: Facts) -> str:
     return f"sweeps over the image at {facts.speed_px_ms:.1f} px/ms"
 
 
-def _hz(rate_hz: float) -> str:
+def _format_rate(rate_hz: float) -> str:
     return f"{rate_hz / 1e3:.4g} kHz" if rate_hz >= 1000 else f"{rate_hz:.3g} Hz"
