@@ -153,7 +153,7 @@ def measure_stream(latency_s: float, ahead: int, pause_s: float, packets: int = 
             streamed.send(packet)
             if pause_s:
                 streamed.wait(pause_s)
-    played = device.records().played()
+    played = device.take_led_record().select_chips()
     starts = starts_of(played.chips(), played.ticks, symbols.shape[0], link.packet.packet_chips)
     delays_ms = (np.array(starts) / (device.TICK_HZ / 1e6) - np.array(calls)) / 1e3
     return Measured(delays_ms, streamed.requests / packets, streamed.underruns)
@@ -197,7 +197,7 @@ def flash() -> None:
             with contextlib.suppress(BoardError):
                 flash_image(RomLoader(line), image)
                 right += rom.flash[: len(image.data)] == image.data
-                seconds.append(line.now())
+                seconds.append(line.time_s())
         kind = f"a byte in {one_in} bad" if one_in else "a good line"
         print(f"flash {len(image.data)} bytes, {kind}: {right} of 10 right, {np.mean(seconds):.1f} s")
 

@@ -1,4 +1,4 @@
-"""Builds the firmware on demand, into the user's cache, keyed by the sources."""
+"""Builds the firmware on demand into the user's cache, under a hash of the sources."""
 
 import fcntl
 import hashlib
@@ -14,12 +14,12 @@ FIRMWARE = Path(__file__).parent / "firmware"
 """The firmware's source tree."""
 
 TARGETS = {"stm32f405-8mhz": "stm32f405", "stm32f405-12mhz": "stm32f405-12mhz"}
-"""Boards that an image is built for, by part and crystal, and the names of their images."""
+"""Names of the images, by part and crystal."""
 
 
 @cache
 def build_folder() -> Path:
-    """Where the firmware is built: `evlcp/firmware-HASH` in the user's cache."""
+    """The folder for builds: `evlcp/firmware-HASH` in the user's cache."""
     digest = hashlib.sha256()
     for path in sorted(FIRMWARE.rglob("*")):
         if path.suffix in (".c", ".h", ".ld") or path.name == "Makefile":
@@ -31,13 +31,13 @@ def build_folder() -> Path:
     return cache_folder / "evlcp" / f"firmware-{digest.hexdigest()[:16]}"
 
 
-def make(*targets: str) -> Path:
-    """Run make in the firmware tree; returns the build folder.
+def run_make(*targets: str) -> Path:
+    """Run make in the firmware tree; return the build folder.
 
     Raises:
         ToolchainError: A tool is missing, or a step fails.
     """
-    _need("make", "make gcc")
+    _require_tool("make", "make gcc")
     folder = build_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -48,7 +48,7 @@ def make(*targets: str) -> Path:
             " that can be written"
         ) from fault
     with (folder / "lock").open("w") as lock:
-        # Two programs may want the same image at once.
+        # Two programs may build the same image at once.
         fcntl.flock(lock, fcntl.LOCK_EX)
         done = subprocess.run(
             ["make", "-s", "-C", str(FIRMWARE), f"BUILD={folder}", *targets],
@@ -64,28 +64,28 @@ def make(*targets: str) -> Path:
     return folder
 
 
-def _need(name: str, package: str) -> None:
+def _require_tool(name: str, package: str) -> None:
     if shutil.which(name) is None:
         raise ToolchainError(f"{name} is missing: apt-get install --no-install-recommends {package}")
 
 
 def native_library() -> Path:
-    """The board as a shared library for this machine.
+    """Build the board as a shared library for this machine; return its path.
 
     Raises:
         ToolchainError: No C compiler, or it fails.
     """
-    _need(os.environ.get("CC", "cc"), "gcc libc6-dev make")
-    return make("library") / "libevlcp-board.so"
+    _require_tool(os.environ.get("CC", "cc"), "gcc libc6-dev make")
+    return run_make("library") / "libevlcp-board.so"
 
 
 def arm_image(board: str) -> Path:
-    """The ARM image of a board: `stm32f405` or `stm32f405-12mhz`.
+    """Build the ARM image of a board, `stm32f405` or `stm32f405-12mhz`; return its path.
 
-    With `-1` or `-2` one for the two places of updates.
+    With `-1` or `-2` it is for one of the two places of updates.
 
     Raises:
         ToolchainError: The cross compiler is missing, or fails.
     """
-    _need("arm-none-eabi-gcc", "gcc-arm-none-eabi")
-    return make("images" if board[-2:] in ("-1", "-2") else "stm32") / f"{board}.elf"
+    _require_tool("arm-none-eabi-gcc", "gcc-arm-none-eabi")
+    return run_make("images" if board[-2:] in ("-1", "-2") else "stm32") / f"{board}.elf"

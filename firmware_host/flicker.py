@@ -29,11 +29,11 @@ class ClusterFlicker:
     Attributes:
         cluster: Its number.
         on_share: Share of chips that are on.
-        longest_run: Longest run of equal chips, the table played round and round.
+        longest_run: Longest run of equal chips in the repeated table.
         line_hz: Frequency of the worst line below 3 kHz.
         line_percent: Its modulation, percent of the mean light (sine of amplitude A on mean M: 100 A / M).
-        limit_percent: What is free of observable effect at that frequency; infinite if there is no line
-            below 3 kHz.
+        limit_percent: Largest modulation without observable effect at that frequency; infinite if there is no
+            line below 3 kHz.
         low_risk: Whether every line is within the low-risk bound.
         no_effect: Whether every line is within the no-effect bound.
     """
@@ -48,7 +48,7 @@ class ClusterFlicker:
     no_effect: bool
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain values; what is infinite is None, as JSON has no number for it."""
+        """The fields as plain values; an infinite limit is None, as JSON has no such number."""
         limit = self.limit_percent if math.isfinite(self.limit_percent) else None
         return asdict(self) | {"limit_percent": limit}
 
@@ -66,14 +66,14 @@ def bound_percent(frequency_hz: Floats, bound: tuple[float, float, float]) -> Fl
     return np.where(frequency_hz > end_hz, np.inf, percent)
 
 
-def check(chips: NDArray[np.uint8], chip_rate_hz: float) -> list[ClusterFlicker]:
+def measure_flicker(chips: NDArray[np.uint8], chip_rate_hz: float) -> list[ClusterFlicker]:
     """Balance, runs and spectral lines of a chip table that repeats, uint8 (chips, clusters).
 
-    Played round and round the table is periodic: its light has lines at multiples of chip_rate / chips. A
-    chip is a rectangle, so a line at f is weakened by sinc(f / chip_rate).
+    The light of the repeated table has lines at multiples of chip_rate / chips. A chip is a rectangle, which
+    attenuates a line at f by sinc(f / chip_rate).
 
     >>> table = np.tile([[0], [1]], (100, 1)).astype(np.uint8)
-    >>> check(table, 10_000.0)[0].line_percent
+    >>> measure_flicker(table, 10_000.0)[0].line_percent
     0.0
     """
     n = len(chips)
@@ -84,7 +84,7 @@ def check(chips: NDArray[np.uint8], chip_rate_hz: float) -> list[ClusterFlicker]
     share = chips.mean(axis=0)
     percent = 100.0 * amplitude[low] / np.where(share, share, np.inf)
     percent[percent < 1e-9] = 0.0
-    # a line without modulation stands for none
+    # a line without modulation, in case there is none
     percent = np.vstack([percent, np.zeros(len(share))])
     line_hz = np.append(frequency[low], 0.0)
     bound = np.append(bound_percent(frequency[low], NO_EFFECT), np.inf)

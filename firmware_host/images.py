@@ -11,19 +11,19 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.files import read_bytes
 
 FLASH_START = 0x0800_0000
-"""Where an STM32's flash begins."""
+"""Address of an STM32's flash."""
 FLASH_BYTES = 1 << 20
-"""What an STM32F405 has of it."""
+"""Size of an STM32F405's flash."""
 
 
 def check_flash_file(path: Path) -> None:
-    """Raise InputError unless an emulator can keep its flash in a file, which need not be there."""
+    """Raise InputError unless an emulator can keep its flash in a file, existing or new."""
     try:
         if not path.is_file() and path.exists():
             raise InputError(f"{path}: not a file; expected the name of a flash file, there or new")
         if path.is_file():
             path.open("rb").close()
-        # SAVE puts a new file in the place of the old one
+        # SAVE replaces the file
         tempfile.TemporaryFile(dir=path.resolve().parent).close()
     except OSError as fault:
         raise InputError(f"{path}: the flash file cannot be used: {fault.strerror}") from fault
@@ -34,7 +34,7 @@ class FlashImage:
     """Bytes of a flash; gaps are 0xff, as erased.
 
     Attributes:
-        address: Where they stand.
+        address: Address of the first byte.
         data: The bytes.
     """
 
@@ -43,7 +43,7 @@ class FlashImage:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read an `.elf`, `.hex` or `.bin` file; the last one stands at the start of the flash.
+        """Read an `.elf`, `.hex` or `.bin` file; a `.bin` begins at the start of the flash.
 
         Raises:
             InputError: It cannot be read, is damaged, or does not fit the flash.

@@ -94,7 +94,7 @@ def light_of(symbols: ArrayLike, link: Link, chips: int, trace: Path | None = No
         programmed = provision(board, bank, Settings())
         device.run(math.ceil(chips / link.air.chip_rate_hz * 1e6) + 1000)
         about = board.about
-        record = device.records().played()
+        record = device.take_led_record().select_chips()
     told = symbol_chips(symbols, link.codebook, link.packet.pilot_every)
     played = record.chips(link.bar.led_clusters())
     differ = played != told[np.arange(len(played)) % len(told)]

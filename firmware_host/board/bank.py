@@ -14,7 +14,7 @@ from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_npy
 from evlcp_sdk.link.resolve import Link
 from firmware_host.protocol.generated.requests import CLUSTERS, ROW_BYTES, Format
-from firmware_host.protocol.rows import BOARD_LEDS, rows_of_leds
+from firmware_host.protocol.rows import BOARD_LEDS, pack_led_rows
 
 WORD_CHIPS = 16
 PREAMBLE_CHIPS = 32
@@ -114,7 +114,7 @@ class Bank:
         """Whole packets as they stand in a bank."""
         if self.format == Format.MASKS:
             by_cluster = chips.shape[1] == self.clusters
-            return rows_of_leds(chips[:, self.led_clusters] if by_cluster else chips).tobytes()
+            return pack_led_rows(chips[:, self.led_clusters] if by_cluster else chips).tobytes()
         if self.format == Format.CLUSTERS:
             return np.packbits(chips, axis=1).tobytes()
         packet = self.packet
@@ -153,7 +153,7 @@ class Bank:
         """What stands before the first packet: the masks of the clusters."""
         if self.format != Format.CLUSTERS:
             return b""
-        return rows_of_leds(self.led_clusters == np.arange(self.clusters)[:, None]).tobytes()
+        return pack_led_rows(self.led_clusters == np.arange(self.clusters)[:, None]).tobytes()
 
     @property
     def packet_bytes(self) -> int:

@@ -177,7 +177,7 @@ class Board:
 
     def read(self, bank: int, offset: int, length: int) -> bytes:
         """A bank's bytes."""
-        most = self.about.max_payload - protocol.ReadReply.fixed_bytes()
+        most = self.about.max_payload - protocol.ReadReply.min_bytes()
         end, found = offset + length, list[tuple[int, bytes]]()
         reads = (protocol.ReadRequest(bank, at, min(most, end - at)) for at in range(offset, end, most))
         self.session.call_each(reads, lambda _, reply: found.append((reply.offset, reply.data)))
@@ -496,7 +496,7 @@ class Board:
         done = len(content) - total
         if progress is not None:
             progress(done, len(content))
-        piece = self.session.max_payload - protocol.WriteRequest.fixed_bytes()
+        piece = self.session.max_payload - protocol.WriteRequest.min_bytes()
         left = deque((at, at + n) for at, n in missing)
 
         def requests() -> Iterator[protocol.WriteRequest]:
@@ -555,12 +555,12 @@ class Board:
             status: What the board said last: its watchdog counts.
         """
         line = self.session.transport
-        end = line.now() + seconds
+        end = line.time_s() + seconds
         acts = status.watchdog != Watchdog.KEEP
         pulse = status.watchdog_ms / 3e3 if acts else seconds
-        while (left := end - line.now()) > 0.0:
+        while (left := end - line.time_s()) > 0.0:
             line.read(min(left, pulse))
-            if acts and line.now() < end:
+            if acts and line.time_s() < end:
                 self.status()
 
     def wait_dark(self, timeout_s: float = 10.0) -> protocol.StatusReply:

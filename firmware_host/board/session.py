@@ -215,8 +215,8 @@ class Session:
         status = self.call(protocol.StatusRequest())
         # an older board's packet by its frames: a preamble of 32 chips at most, 32 a frame
         packet_s = (status.packet_chips or 32 + 32 * status.frames) / status.chip_rate_hz
-        end = self.transport.now() + timeout_s + packet_s
-        while not done(status) and self.transport.now() <= end:
+        end = self.transport.time_s() + timeout_s + packet_s
+        while not done(status) and self.transport.time_s() <= end:
             self.transport.read(pause_s)
             status = self.call(protocol.StatusRequest())
         return status
@@ -236,7 +236,7 @@ class Session:
 
     def _check_known(self, request: WireRequest[Any]) -> None:
         """Raise IncompatibleError if the board's protocol is too old for a request."""
-        later = request.later(self.client.minor)
+        later = request.find_unsupported(self.client.minor)
         if later is None:
             return
         what = protocol.Type(request.TYPE).name + ("" if later == "it" else f" with {later}")
@@ -274,19 +274,19 @@ class Session:
         more = True
         try:
             while sent or more:
-                while more and self.client.room:
+                while more and self.client.has_room:
                     request = next(source, None)
                     if request is None:
                         more = False
                     else:
                         self._check_known(request)
                         sent[self.client.submit(request)] = request
-                data, deadline = self.client.poll(self.transport.now())
+                data, deadline = self.client.poll(self.transport.time_s())
                 if data:
                     self.transport.write(data)
-                wait = 0.0 if deadline is None else max(0.0, deadline - self.transport.now())
+                wait = 0.0 if deadline is None else max(0.0, deadline - self.transport.time_s())
                 received = self.transport.read(wait) if sent else b""
-                for outcome in self.client.receive(received, self.transport.now()):
+                for outcome in self.client.receive(received, self.transport.time_s()):
                     handle(sent.pop(outcome.token), outcome)
         finally:
-            self.client.forget()
+            self.client.drop_requests()

@@ -62,10 +62,10 @@ def wait_for_pulse(boards: Sequence[Board], timeout_s: float) -> None:
         LineError: They do not within `timeout_s`.
     """
     line = boards[0].session.transport
-    end = line.now() + timeout_s
+    end = line.time_s() + timeout_s
     waiting = list(boards)
     while waiting := [board for board in waiting if board.status().state == State.WAITING]:
-        if line.now() >= end:
+        if line.time_s() >= end:
             pulses = [board.status().pulses for board in waiting]
             for board in boards:
                 with contextlib.suppress(BoardError):
@@ -76,4 +76,4 @@ def wait_for_pulse(boards: Sequence[Board], timeout_s: float) -> None:
                 f"{waiting[0].session.name}: the pulse that it waits for has not come in {timeout_s:g} s"
                 f" (pulses since reset: {told}): check the wire of the pulse input; all are stopped"
             )
-        line.read(min(0.02, max(0.0, end - line.now())))
+        line.read(min(0.02, max(0.0, end - line.time_s())))

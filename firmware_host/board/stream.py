@@ -21,7 +21,7 @@ from firmware_host.protocol.generated.requests import PushRequest, StopRequest
 AHEAD = 4
 """Packets that wait on the board, the one that plays among them, unless the caller says otherwise."""
 
-_PIECE_OVERHEAD = PushRequest.fixed_bytes()
+_PIECE_OVERHEAD = PushRequest.min_bytes()
 _DARK_S = 10.0
 
 
@@ -88,7 +88,7 @@ class Stream:
         self._flight: dict[int, tuple[_Piece | None, PushRequest]] = {}
         self._position = (0, 0)
         self.packet_s = like.packet.packet_chips / like.chip_rate_hz
-        self._heard_s = session.transport.now()
+        self._heard_s = session.transport.time_s()
         self._hold_s = self._heard_s
         # the latest at which the newest packet that is known to have begun did so; the first begins at once
         self._begun_s = self._heard_s - self.packet_s
@@ -122,7 +122,7 @@ class Stream:
     def delay_s(self) -> float:
         """How long a packet that is sent now waits for its first chip, as far as can be told, s."""
         begins_s = self._begun_s + (self._next - self.begun + 1) * self.packet_s
-        return max(0.0, begins_s - self._session.transport.now())
+        return max(0.0, begins_s - self._session.transport.time_s())
 
     def play(
         self,
@@ -142,15 +142,15 @@ class Stream:
             BoardError: The line or the board fails.
         """
         line = self._session.transport
-        due_s, number = line.now(), 0
+        due_s, number = line.time_s(), 0
         while not stopped() and (packets := make(number)) is not None:
             number += 1
-            due_s = max(due_s + every_s, line.now())
+            due_s = max(due_s + every_s, line.time_s())
             sent = []
             for packet in takewhile(lambda _: not stopped(), packets):
                 sent.append(packet)
                 self.send(packet)
-            while sent and line.now() < due_s and not stopped():
+            while sent and line.time_s() < due_s and not stopped():
                 for packet in takewhile(lambda _: not stopped(), sent):
                     self.send(packet)
         return number
@@ -197,8 +197,8 @@ class Stream:
         Raises:
             BoardError: The line or the board fails.
         """
-        end = self._session.transport.now() + seconds
-        while (left := end - self._session.transport.now()) > 0.0:
+        end = self._session.transport.time_s() + seconds
+        while (left := end - self._session.transport.time_s()) > 0.0:
             self._pump(min(left, self._pulse_s))
             self._look()
 
@@ -223,7 +223,7 @@ class Stream:
         self._pause = None
         self._pieces.clear()
         self._flight.clear()
-        self._session.client.forget()
+        self._session.client.drop_requests()
         self._session.call(StopRequest())
         self._session.wait_dark(self.packet_s + _DARK_S)
 
@@ -231,7 +231,7 @@ class Stream:
 
     def _look(self) -> None:
         """Ask how the queue stands if nothing was heard for long."""
-        if not self._flight and self._session.transport.now() - self._heard_s >= self._pulse_s:
+        if not self._flight and self._session.transport.time_s() - self._heard_s >= self._pulse_s:
             self._submit(None, PushRequest(self._bank, *self._position, 0, b""))
 
     def _submit(self, piece: _Piece | None, request: PushRequest) -> None:
@@ -246,14 +246,14 @@ class Stream:
     def _pump(self, wait_s: float) -> None:
         """Send what may go out, and read for at most `wait_s`."""
         client, line = self._session.client, self._session.transport
-        now = line.now()
+        now = line.time_s()
         free = now + wait_s
         if self._pause is not None and not self._pieces:
             free = self._free_s(self._next, 2)
             if free <= now:
                 self._put(self._pause)
                 self.pauses += 1
-        while self._pieces and client.room:
+        while self._pieces and client.has_room:
             free = self._free_s(self._pieces[0].number, self._ahead)
             if free > now:
                 break
@@ -265,15 +265,15 @@ class Stream:
             line.write(data)
         end = min(free, now + wait_s, now + wait_s if deadline is None else deadline)
         # a packet that has gone out is not waited for
-        done = not self._pieces and client.room and bool(data)
-        received = line.read(0.0 if done else max(0.0, end - line.now()))
-        for outcome in client.receive(received, line.now()):
+        done = not self._pieces and client.has_room and bool(data)
+        received = line.read(0.0 if done else max(0.0, end - line.time_s()))
+        for outcome in client.receive(received, line.time_s()):
             self._take(outcome)
 
     def _take(self, outcome: RequestOutcome) -> None:
         piece, request = self._flight.pop(outcome.token)
         reply = self._session.checked(request, outcome)
-        now = self._session.transport.now()
+        now = self._session.transport.time_s()
         self._position = max(self._position, (reply.number, reply.offset))
         if reply.begun > self.begun:
             # packets follow each other without a gap, unless the board had none

@@ -37,12 +37,12 @@ def survey(
         usb: List and ask only ports with this USB id.
         every: Ask all that are listed.
     """
-    listed = [p for p in (serial_ports() if ports is None else ports) if usb is None or usb.takes(p)]
+    listed = [p for p in (serial_ports() if ports is None else ports) if usb is None or usb.matches(p)]
     if not listed:
         return []
 
     def look(port: SerialPort) -> Found:
-        if not (every or usb is not None or port.likely):
+        if not (every or usb is not None or port.has_common_bridge):
             return Found(port, False, None, "no USB id of a board's bridge: not asked")
         try:
             line = open_transport(port.device, baud)

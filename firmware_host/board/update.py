@@ -152,7 +152,7 @@ def update(
             Status.OUT_OF_RANGE,
         )
     session.call(protocol.UpdateBeginRequest(before.next, len(data), zlib.crc32(data)))
-    piece = (session.max_payload - protocol.UpdateWriteRequest.fixed_bytes()) // 4 * 4
+    piece = (session.max_payload - protocol.UpdateWriteRequest.min_bytes()) // 4 * 4
 
     done = 0
 
@@ -187,10 +187,10 @@ def _restart(board: Board, wait_s: float) -> None:
     session, line = board.session, board.session.transport
     taken = board.status().requests
     session.call(protocol.UpdateRestartRequest())
-    begin = line.now()
+    begin = line.time_s()
     # a slow one gets longer
     end = begin + wait_s + 20 * session.client.latency_s
-    while line.now() < begin + 0.1:  # the answer is out, and the reset under way
+    while line.time_s() < begin + 0.1:  # the answer is out, and the reset under way
         line.read(0.02)
     while True:
         try:
@@ -198,9 +198,9 @@ def _restart(board: Board, wait_s: float) -> None:
             if board.status().requests < taken:
                 return
         except BoardError:
-            if line.now() > end:
+            if line.time_s() > end:
                 raise
             continue
-        if line.now() > end:
+        if line.time_s() > end:
             raise VerifyError(f"{session.name}: has not been reset; run the command again")
         line.read(0.02)

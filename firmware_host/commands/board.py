@@ -98,7 +98,7 @@ def ports(
     if ask:
         found = survey(line.baud, None, wanted, every)
     else:
-        listed = [p for p in serial_ports() if wanted is None or wanted.takes(p)]
+        listed = [p for p in serial_ports() if wanted is None or wanted.matches(p)]
         found = [Found(p, False, None, "not asked") for p in listed]
     if as_json:
         rows = []
@@ -628,11 +628,11 @@ def emulate(
     """
     from evlcp_sdk.files import check_output
     from evlcp_sdk.signals import stop_on_request
-    from firmware_host.emulators.listening import HostLine, check_listen
+    from firmware_host.emulators.listening import HostLine, check_listen_address
     from firmware_host.emulators.models import part_image, serve_part
-    from firmware_host.emulators.native import NativeBoard, serve
+    from firmware_host.emulators.native import NativeBoard, serve_board
 
-    check_listen(listen, pty=emulator == "native")
+    check_listen_address(listen, pty=emulator == "native")
     if leds is not None:
         check_output(leds, regular=False)
     with contextlib.ExitStack() as stack:
@@ -644,7 +644,7 @@ def emulate(
         stopped = stack.enter_context(stop_on_request())
         echo(f"listening on {line.place}")
         if emulator == "native":
-            serve(board, line, stopped)
+            serve_board(board, line, stopped)
         else:
             serve_part(line, image, flash, leds, stopped)
 
@@ -724,7 +724,7 @@ def leds(
     from evlcp_sdk.link.resolve import load_link
     from firmware_host.emulators.led_record import LedRecord
 
-    played = LedRecord.read(record).played()
+    played = LedRecord.read(record).select_chips()
     try:
         table = played.chips(None if per_led else load_link(link_file, overrides or []).bar.led_clusters())
     except ConfigError as fault:

@@ -147,11 +147,11 @@ def check(
     For example: [bold]evlcp tx check --random 100[/]
     """
     from firmware_host.board.bank import symbol_chips
-    from firmware_host.flicker import check as measure
+    from firmware_host.flicker import measure_flicker
 
     symbols, link = sent.load()
     chip_rate = link.packet.chip_rate_hz
-    rows = measure(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chip_rate)
+    rows = measure_flicker(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chip_rate)
     if as_json:
         print_json({"chip_rate_hz": chip_rate, "clusters": [r.to_dict() for r in rows]})
     else:

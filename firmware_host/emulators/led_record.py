@@ -1,7 +1,7 @@
-"""LED records of the emulators: what each LED did, chip by chip, and when.
+"""LED records of the emulators: the LEDs' states and times, chip by chip.
 
 A record is 20 bytes, little-endian: u32 tick, u32 chip, 12 bytes of 96 LEDs (LED 0 the most significant bit
-of the first byte). Chip numbers count from START; two of them mean no chip: dark, and the single-LED test.
+of the first byte). Chip numbers count from START; two special ones mark dark and the single-LED test.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ class LedRecord:
         ticks: Tick of each output, unwrapped, int64 (n,).
         numbers: Chip number of each, uint32 (n,).
         rows: LEDs, uint8 (n, 12).
-        cut_bytes: Bytes of a last record that an emulator, ended while it played, did not finish; left out.
+        cut_bytes: Bytes of a last, incomplete record, which is left out.
     """
 
     ticks: NDArray[np.int64]
@@ -37,7 +37,7 @@ class LedRecord:
 
     @classmethod
     def of_records(cls, records: NDArray[np.void]) -> "LedRecord":
-        """From an array of `RECORD`; the tick counter wraps at 2**32 and is unwrapped here."""
+        """Convert an array of `RECORD`, whose tick counter wraps at 2**32."""
         tick = records["tick"].astype(np.uint32)
         steps = np.diff(tick)  # modulo 2**32
         start = tick[:1].astype(np.int64)
@@ -49,7 +49,7 @@ class LedRecord:
         """Read a file that an emulator wrote.
 
         Raises:
-            InputError: It cannot be read, has no whole record, or its chips do not follow one another.
+            InputError: It cannot be read, has no whole record, or its chips are not consecutive.
         """
         data = read_bytes(path)
         whole, cut = divmod(len(data), RECORD.itemsize)
@@ -62,7 +62,7 @@ class LedRecord:
         chip = records["chip"].astype(np.int64)
         places = np.flatnonzero(chip < CHIP_TEST)
         chip = chip[places]
-        # within one START each chip follows the one before
+        # chips are consecutive from each START
         before = np.append(-1, chip[:-1])
         wrong = np.flatnonzero((chip != before + 1) & ((chip != 0) | (before == -1)))
         if len(wrong):
@@ -75,14 +75,14 @@ class LedRecord:
         return replace(cls.of_records(records), cut_bytes=cut)
 
     def to_bytes(self) -> bytes:
-        """What `read` takes."""
+        """The record as the content of a file for `read`."""
         records = np.empty(len(self), RECORD)
         records["tick"] = self.ticks.astype(np.uint64) & np.uint64(0xFFFFFFFF)
         records["chip"], records["row"] = self.numbers, self.rows
         return records.tobytes()
 
-    def played(self) -> "LedRecord":
-        """Without the records that are not a chip: dark, and the single-LED test."""
+    def select_chips(self) -> "LedRecord":
+        """The record without dark outputs and the single-LED test."""
         keep = (self.numbers != CHIP_DARK) & (self.numbers != CHIP_TEST)
         return LedRecord(self.ticks[keep], self.numbers[keep], self.rows[keep], self.cut_bytes)
 
@@ -93,7 +93,7 @@ class LedRecord:
             led_clusters: The cluster of each LED; None for a column of every LED.
 
         Raises:
-            ConfigError: LEDs of one cluster differ, or one that is in none is lit.
+            ConfigError: LEDs of one cluster differ, or one without a cluster is lit.
         """
         leds = np.unpackbits(self.rows, axis=1)
         if led_clusters is None:

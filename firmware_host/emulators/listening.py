@@ -1,4 +1,4 @@
-"""Where emulators listen for a host: a socket or a pseudo-terminal."""
+"""The board's end of an emulator's line: a socket or a pseudo-terminal."""
 
 import os
 import select
@@ -10,14 +10,14 @@ from evlcp_sdk.errors import ConfigError
 from firmware_host.errors import NoBoardError, ToolchainError
 from firmware_host.ports.transport import SocketTransport, socket_address
 
-_MOST_BYTES = 2048
+_READ_BYTES = 2048
 
 
-def check_listen(listen: str, pty: bool) -> None:
-    """Raise ConfigError unless an emulator can listen there, and nobody answers; a socket left behind may be.
+def check_listen_address(listen: str, pty: bool) -> None:
+    """Raise ConfigError if the address is invalid, or another program listens there.
 
     Args:
-        listen: What `--listen` says.
+        listen: The option `--listen`.
         pty: Whether it may be a pseudo-terminal.
     """
     if listen == "pty" and pty:
@@ -34,26 +34,26 @@ def check_listen(listen: str, pty: bool) -> None:
 
 
 class HostLine:
-    """The board's end of a line, for one host at a time; another one is hung up on.
+    """The board's end of a line, for one host at a time; others are disconnected.
 
     Args:
-        listen: `unix:PATH`, where a socket left behind is replaced, `tcp:HOST:PORT`, or `pty`.
-        link: Name for the pseudo-terminal; a link of that name is replaced.
+        listen: `unix:PATH`, where an old socket is replaced, `tcp:HOST:PORT`, or `pty`.
+        link: Symbolic link to the pseudo-terminal; an old one is replaced.
 
     Attributes:
-        place: What hosts connect to.
+        place: Address for hosts.
 
     Raises:
-        ToolchainError: One cannot listen there.
+        ToolchainError: It cannot listen there.
     """
 
     def __init__(self, listen: str, link: Path | None = None) -> None:
         self.place = listen
         self._server: socket.socket | None = None
         self._host: int | None = None
-        self._others: list[int] = []
+        self._terminal_ends: list[int] = []
         self._link: Path | None = link
-        self._out = b""
+        self._unsent = b""
         try:
             if listen == "pty":
                 self._open_terminal(link)
@@ -79,9 +79,9 @@ class HostLine:
         return server
 
     def _open_terminal(self, link: Path | None) -> None:
-        # The other end stays open, so that a host that leaves does not hang up the line.
+        # The other end stays open, so that the line outlives a host.
         self._host, end = os.openpty()
-        self._others = [end]
+        self._terminal_ends = [end]
         tty.setraw(end)
         os.set_blocking(self._host, False)
         self.place = os.ttyname(end)
@@ -92,19 +92,21 @@ class HostLine:
             self.place = str(link)
 
     def exchange(self, data: bytes, wait_s: float) -> bytes:
-        """Send to the host, if there is one, and give what it has sent, after at most `wait_s`."""
+        """Send to the host, if there is one; return what it has sent, after at most `wait_s`."""
         host = self._host
-        self._out = self._out + data if host is not None else b""
+        self._unsent = self._unsent + data if host is not None else b""
         server = [] if self._server is None else [self._server.fileno()]
         ends = [] if host is None else [host]
-        ready, free, _ = select.select(server + ends * (not self._out), ends * bool(self._out), [], wait_s)
+        ready, free, _ = select.select(
+            server + ends * (not self._unsent), ends * bool(self._unsent), [], wait_s
+        )
         if self._server is not None and self._server.fileno() in ready:
-            self._take_host(self._server)
+            self._accept_host(self._server)
         try:
             if host is not None and free:
-                self._out = self._out[os.write(host, self._out) :]
+                self._unsent = self._unsent[os.write(host, self._unsent) :]
             if host is not None and host in ready:
-                if found := os.read(host, _MOST_BYTES):
+                if found := os.read(host, _READ_BYTES):
                     return found
                 self._hang_up()
         except BlockingIOError:
@@ -113,9 +115,9 @@ class HostLine:
             self._hang_up()
         return b""
 
-    def _take_host(self, server: socket.socket) -> None:
+    def _accept_host(self, server: socket.socket) -> None:
         if self._host is not None and _has_left(self._host):
-            return  # first all that it has sent is read
+            return  # all that it has sent is read first
         found, _ = server.accept()
         if self._host is not None:
             found.close()
@@ -129,9 +131,9 @@ class HostLine:
         self._host = None
 
     def close(self) -> None:
-        """Listen no longer; the socket or the link is removed."""
+        """Stop listening, and remove the socket or the link."""
         self._hang_up()
-        for end in self._others:
+        for end in self._terminal_ends:
             os.close(end)
         if self._server is not None:
             self._server.close()

@@ -1,4 +1,4 @@
-"""Models of the part, which stand with the tests: boards of a checkout alone."""
+"""Emulated parts, whose models are among the tests of a checkout."""
 
 import importlib
 import importlib.util
@@ -16,10 +16,10 @@ _ROOT = Path(__file__).parents[2]
 
 
 def part_image(rom: bool, flash: Path | None) -> Path | None:
-    """The image that a part is to run; None for one that waits in its ROM, and runs what it is told to.
+    """The image that a part runs; None for one that waits in its ROM.
 
     Raises:
-        InputError: The file of its flash, 1 MiB, new or there, cannot be used.
+        InputError: The file of its flash, 1 MiB, existing or new, cannot be used.
         ToolchainError: The model or its core is missing, or the image cannot be built.
     """
     if not (_ROOT / "tests" / "models").is_dir():
@@ -40,6 +40,6 @@ def part_image(rom: bool, flash: Path | None) -> Path | None:
 def serve_part(
     line: HostLine, image: Path | None, flash: Path | None, leds: Path | None, stopped: Callable[[], bool]
 ) -> None:
-    """Let hosts talk to an STM32F405 that runs an image of `part_image`, until it is stopped."""
+    """Let hosts talk to an STM32F405 with an image of `part_image` until it is stopped."""
     sys.path.insert(0, str(_ROOT))
     importlib.import_module("tests.models.server").serve_part(line, image, flash, leds, stopped)

@@ -1,4 +1,4 @@
-"""The native board: the firmware compiled for this machine, whose chips fall due by the clock."""
+"""The native board: the firmware compiled for this machine, in real time."""
 
 import os
 import stat
@@ -14,17 +14,17 @@ from firmware_host.images import check_flash_file
 from firmware_host.ports.transport import Transport
 
 _PIECE = 2048
-"""Bytes that the board receives at once: half of what it has room for."""
+"""Bytes that the board receives at once: half of its buffer."""
 
 _STEP_S = 0.005
 
 
 class NativeBoard:
-    """A board of its own time, which follows the clock whenever something is exchanged with it.
+    """A board in virtual time that catches up with the clock in every `exchange`.
 
     Args:
         leds: File for the LED records.
-        flash: File that keeps what SAVE writes, new or there.
+        flash: File for what SAVE writes, existing or new.
         unique_id: The board's number, 64 bits.
 
     Raises:
@@ -35,45 +35,45 @@ class NativeBoard:
 
     def __init__(self, leds: Path | None = None, flash: Path | None = None, unique_id: int = 0) -> None:
         self._device = SimulatedBoard(bytes(4) + unique_id.to_bytes(8, "big"))
-        self._held = self._device.flash()
+        self._saved_flash = self._device.read_flash()
         self._flash = None if flash is None else flash.resolve()
         if flash is not None:
             check_flash_file(flash)
             if flash.is_file():
                 held = read_bytes(flash)
-                if len(held) != len(self._held):
-                    raise InputError(f"{flash}: not a flash file of {len(self._held)} bytes")
-                self._device.set_flash(held)
-            self._store(self._device.flash())  # a place that takes no SAVE is known now
+                if len(held) != len(self._saved_flash):
+                    raise InputError(f"{flash}: not a flash file of {len(self._saved_flash)} bytes")
+                self._device.replace_flash(held)
+            self._save_flash(self._device.read_flash())  # raises now if SAVE could not write it
         with writing(leds or ""):
             self._leds = None if leds is None else leds.open("wb")
-        self._begun_s = time.monotonic()
+        self._start_s = time.monotonic()
 
     def exchange(self, data: bytes) -> bytes:
-        """Let time pass until now, give the board what a host has sent, and take what it sends."""
-        self._device.run(int((time.monotonic() - self._begun_s) * 1e6) - self._device.now_us)
+        """Let time pass until now, and exchange bytes from a host for those of the board."""
+        self._device.run(int((time.monotonic() - self._start_s) * 1e6) - self._device.now_us)
         for at in range(0, len(data), _PIECE):
             self._device.receive(data[at : at + _PIECE])
             self._device.run(0)
-        # Before the answer to a SAVE goes out, the slots are in the file.
-        if self._flash is not None and (held := self._device.flash()) != self._held:
-            self._store(held)
-        records = self._device.take_records()
+        # The slots are in the file before the answer to a SAVE is sent.
+        if self._flash is not None and (held := self._device.read_flash()) != self._saved_flash:
+            self._save_flash(held)
+        records = self._device.take_raw_records()
         if self._leds is not None:
             with writing(self._leds.name):
                 self._leds.write(records.tobytes())
                 self._leds.flush()
-        return self._device.sent()
+        return self._device.take_output()
 
     def close(self) -> None:
-        """Switch it off: its files are whole."""
+        """Switch it off, and close its files."""
         if self._leds is not None:
             self._leds.close()
 
-    def _store(self, held: bytes) -> None:
-        """A new file takes the place of the old one when it is whole; a link stays one.
+    def _save_flash(self, held: bytes) -> None:
+        """Replace the flash file when the new one is complete; a symbolic link stays.
 
-        It may hold a key: it is as private as the old one was, and at first for its owner alone.
+        It may hold a key: it keeps the permissions of the old one, and a new one is for its owner alone.
         """
         if self._flash is not None:
             with Outputs() as outputs, writing(self._flash):
@@ -82,38 +82,38 @@ class NativeBoard:
                 os.fchmod(file.fileno(), mode)
                 file.write(held)
                 outputs.commit()
-        self._held = held
+        self._saved_flash = held
 
 
 class NativeLine(Transport):
-    """A native board in this process; it ends with the line."""
+    """A line to a native board in this process, which ends with the line."""
 
     name = "native:"
 
     def __init__(self, board: NativeBoard) -> None:
         self._board = board
-        self._came = b""
+        self._received = b""
 
     def read(self, timeout_s: float) -> bytes:
         """See `Transport.read`."""
-        end = self.now() + timeout_s
+        end = self.time_s() + timeout_s
         while True:
-            data, self._came = self._came + self._board.exchange(b""), b""
-            left = end - self.now()
+            data, self._received = self._received + self._board.exchange(b""), b""
+            left = end - self.time_s()
             if data or left <= 0:
                 return data
             time.sleep(min(left, 0.001))
 
     def write(self, data: bytes) -> None:
         """See `Transport.write`."""
-        self._came += self._board.exchange(data)
+        self._received += self._board.exchange(data)
 
     def close(self) -> None:
-        """The board ends."""
+        """Switch the board off."""
         self._board.close()
 
 
-def serve(board: NativeBoard, line: HostLine, stopped: Callable[[], bool]) -> None:
+def serve_board(board: NativeBoard, line: HostLine, stopped: Callable[[], bool]) -> None:
     """Let hosts talk to a board, one at a time, until it is stopped."""
     data = b""
     while not stopped():

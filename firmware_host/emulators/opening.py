@@ -1,7 +1,7 @@
 """Ports by name, emulators among them.
 
-`native:` (`native:FILE` keeps its flash) starts an emulator that lives as long as the line; all else is a
-port of `firmware_host.ports.transport`.
+`native:` (`native:FILE` keeps its flash) starts an emulator that ends with the line; other names are ports of
+`firmware_host.ports.transport`.
 """
 
 from pathlib import Path
@@ -12,7 +12,7 @@ from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
 
 def open_port(spec: str, baud: int = DEFAULT_BAUD) -> Transport:
-    """Open a port, or start an emulator, by its name; see the module.
+    """Open a port, or start an emulator, by its name.
 
     Raises:
         InputError: The emulator's flash file cannot be used.

@@ -22,7 +22,7 @@ class _Health(ctypes.Structure):
 
 
 class Bench(ctypes.Structure):
-    """What can be read and turned on a board: `struct native_bench` of `hal/native/board.h`."""
+    """A board's outputs and settings for tests: `struct native_bench` of `hal/native/board.h`."""
 
     _fields_: ClassVar = [
         ("output", ctypes.c_void_p),
@@ -56,10 +56,10 @@ def _library() -> ctypes.CDLL:
 
 
 class SimulatedBoard:
-    """One board, of a number of 12 bytes; time moves only in `run`.
+    """One board with a unique id of 12 bytes; time passes only in `run`.
 
     Attributes:
-        bench: What can be read and turned on it.
+        bench: Its outputs, and settings for tests.
         now_us: Time since it was made, us.
 
     Raises:
@@ -84,38 +84,38 @@ class SimulatedBoard:
         self.now_us += us
 
     def reset(self) -> None:
-        """Reset: all but the flash is lost."""
+        """Reset the board: only its flash stays."""
         self._c.board_reset(self._board)
 
     def receive(self, data: bytes) -> None:
-        """Bytes reach the board."""
+        """Deliver bytes to the board."""
         self._c.board_input(self._board, data, len(data))
 
-    def sent(self) -> bytes:
-        """Bytes the board has sent since the last call."""
+    def take_output(self) -> bytes:
+        """Bytes that the board has sent since the last call."""
         count, self.bench.output_length = self.bench.output_length, 0
         return ctypes.string_at(self.bench.output, count)
 
-    def take_records(self) -> NDArray[np.void]:
-        """LED outputs since the last call, an array of `RECORD`."""
+    def take_raw_records(self) -> NDArray[np.void]:
+        """LED outputs since the last call, as an array of `RECORD`."""
         count, self.bench.record_count = self.bench.record_count, 0
         return np.frombuffer(ctypes.string_at(self.bench.records or 0, count * RECORD.itemsize), RECORD)
 
-    def records(self) -> LedRecord:
+    def take_led_record(self) -> LedRecord:
         """LED outputs since the last call."""
-        return LedRecord.of_records(self.take_records())
+        return LedRecord.of_records(self.take_raw_records())
 
-    def flash(self) -> bytes:
-        """The slots of SAVE."""
+    def read_flash(self) -> bytes:
+        """The flash with the slots of SAVE."""
         return ctypes.string_at(self.bench.flash, self.bench.flash_bytes)
 
-    def set_flash(self, content: bytes) -> None:
-        """Be a board that has these slots, and has just been reset."""
+    def replace_flash(self, content: bytes) -> None:
+        """Write the flash with the slots of SAVE, and reset the board."""
         ctypes.memmove(self.bench.flash, content, self.bench.flash_bytes)
         self.reset()
 
-    def shown(self) -> NDArray[np.uint8]:
-        """The LEDs now, uint8 (96,)."""
+    def lit_leds(self) -> NDArray[np.uint8]:
+        """State of the LEDs now, uint8 (96,)."""
         return np.unpackbits(np.array(self.bench.shown, np.uint8))[:LEDS]
 
 
@@ -124,8 +124,8 @@ class SimulatedLine(Transport):
 
     Args:
         board: The board.
-        name: What to call it in messages.
-        step_us: Time that passes at least when the host waits.
+        name: Its name in messages.
+        step_us: Least time that passes when the host waits.
     """
 
     def __init__(self, board: SimulatedBoard, name: str = "simulated:", step_us: int = 100) -> None:
@@ -133,24 +133,24 @@ class SimulatedLine(Transport):
         self.board = board
         self.step_us = step_us
 
-    def now(self) -> float:
+    def time_s(self) -> float:
         """Time of the board, s."""
         return self.board.now_us * 1e-6
 
     def to_board(self, data: bytes) -> bytes:
-        """What of `data` arrives at the board; here everything."""
+        """The bytes of `data` that arrive at the board; here all."""
         return data
 
     def to_host(self, data: bytes) -> bytes:
-        """What of `data` arrives at the host; here everything."""
+        """The bytes of `data` that arrive at the host; here all."""
         return data
 
     def read(self, timeout_s: float) -> bytes:
-        """Bytes from the board; time passes until some come, or `timeout_s` is over."""
+        """Bytes from the board; time passes until there are some, or `timeout_s` is over."""
         end = self.board.now_us + max(self.step_us, int(timeout_s * 1e6))
         while self.board.now_us < end:
             self.board.run(self.step_us)
-            data = self.board.sent()
+            data = self.board.take_output()
             if data:
                 return self.to_host(data)
         return b""
@@ -160,4 +160,4 @@ class SimulatedLine(Transport):
         self.board.receive(self.to_board(data))
 
     def close(self) -> None:
-        """Nothing to let go."""
+        """Nothing to release."""

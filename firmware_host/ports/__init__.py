@@ -1,1 +1,1 @@
-"""Lines to boards, and which of them answer."""
+"""Lines to boards: serial ports, sockets, and the part's boot loader."""

@@ -14,9 +14,9 @@ from firmware_host.images import FLASH_START, FlashImage
 from firmware_host.ports.transport import Transport
 
 BAUD = 115_200
-"""The fastest rate that the ROM takes for sure, bit/s."""
+"""Fastest rate that the ROM is sure to take, bit/s."""
 PRODUCT = 0x413
-"""What the ROM of an STM32F405 says it is."""
+"""Product number of an STM32F405."""
 SECTORS = (*[16 << 10] * 4, 64 << 10, *[128 << 10] * 7)
 """Sizes of the flash's sectors, bytes."""
 
@@ -40,78 +40,77 @@ class RomLoader:
 
     def __init__(self, transport: Transport) -> None:
         self.line = transport
-        self._got = bytearray()
+        self._received = bytearray()
         for _ in range(_TRIES):
             self.line.write(bytes([_SYNC]))
-            if self._byte(_ANSWER_S) in (_ACK, _NACK):  # NACK: it was in step already
+            if self._read_byte(_ANSWER_S) in (_ACK, _NACK):  # NACK: it was in step already
                 break
-            if self._in_step():  # it waited for the rest of another run's command
+            if self._resynchronize():  # it waited for the rest of another run's command
                 break
         else:
             raise NoBoardError(
                 f"{self.line.name}: no boot loader answers; set BOOT0 high, press reset, and run it again;"
                 " PA9 and PA10 must lead to this port"
             )
-        self._drop()
+        self._drain()
 
     # -- bytes
 
-    def _byte(self, timeout_s: float) -> int | None:
-        end = self.line.now() + timeout_s
-        while not self._got:
-            left = end - self.line.now()
+    def _read_byte(self, timeout_s: float) -> int | None:
+        end = self.line.time_s() + timeout_s
+        while not self._received:
+            left = end - self.line.time_s()
             if left <= 0:
                 return None
-            self._got += self.line.read(left)
-        return self._got.pop(0)
+            self._received += self.line.read(left)
+        return self._received.pop(0)
 
-    def _bytes(self, count: int) -> bytes:
+    def _read_bytes(self, count: int) -> bytes:
         found = bytearray()
         while len(found) < count:
-            byte = self._byte(_ANSWER_S)
+            byte = self._read_byte(_ANSWER_S)
             if byte is None:
                 raise _FailedError(silent=True)
             found.append(byte)
         return bytes(found)
 
-    def _drop(self) -> None:
-        """Forget what comes until the line is quiet."""
-        self._got.clear()
+    def _drain(self) -> None:
+        """Discard what arrives until the line is quiet."""
+        self._received.clear()
         while self.line.read(0.02):
             pass
 
-    def _acknowledged(self, timeout_s: float = _ANSWER_S) -> None:
-        byte = self._byte(timeout_s)
+    def _expect_acknowledgement(self, timeout_s: float = _ANSWER_S) -> None:
+        byte = self._read_byte(timeout_s)
         if byte != _ACK:
             raise _FailedError(silent=byte is None)
 
-    def _in_step(self) -> bool:
-        """After a byte was lost: fill up what it waits for, until it refuses that; whether it did."""
-        self._drop()
-        answered = any(self._answers() for _ in range(_PIECE + 8))
-        self._drop()
+    def _resynchronize(self) -> bool:
+        """Complete a command that lost a byte with 0xff until the loader refuses it; whether it did."""
+        self._drain()
+        for _ in range(_PIECE + 8):
+            self.line.write(b"\xff")
+            if answered := self._read_byte(0.005) is not None:
+                break
+        self._drain()
         return answered
 
-    def _answers(self) -> bool:
-        self.line.write(b"\xff")
-        return self._byte(0.005) is not None
-
-    def _command(
+    def _run_command(
         self, code: int, what: str, *parts: bytes, count: int = 0, timeout_s: float = _ANSWER_S
     ) -> bytes:
-        """Send a command and its parts, each once the one before is acknowledged; bytes of the answer."""
+        """Send a command and its parts, each after an acknowledgement; return `count` bytes of the answer."""
         silent = False
         for _ in range(_TRIES):
             try:
                 self.line.write(bytes([code, code ^ 0xFF]))
-                self._acknowledged()
+                self._expect_acknowledgement()
                 for part in parts:
                     self.line.write(part)
-                    self._acknowledged(timeout_s)
-                return self._bytes(count)
+                    self._expect_acknowledgement(timeout_s)
+                return self._read_bytes(count)
             except _FailedError as failed:
                 silent = failed.silent
-            self._in_step()
+            self._resynchronize()
         if silent:
             raise LineError(f"{self.line.name}: no answer to {what} after {_TRIES} tries; check the line")
         raise RefusedError(
@@ -122,23 +121,25 @@ class RomLoader:
 
     # -- commands
 
-    def product(self) -> int:
-        """Number of the part."""
-        # one less than its bytes, these, and an acknowledgement
-        return int.from_bytes(self._command(_GET_ID, "GET ID", count=4)[1:3], "big")
+    def read_product(self) -> int:
+        """Product number of the part."""
+        # the number of its bytes less one, these, and an acknowledgement
+        return int.from_bytes(self._run_command(_GET_ID, "GET ID", count=4)[1:3], "big")
 
     def read(self, address: int, count: int) -> bytes:
-        """Up to 256 bytes."""
+        """Read up to 256 bytes."""
         wanted = bytes([count - 1, (count - 1) ^ 0xFF])
-        return self._command(_READ, f"READ at {address:#x}", _place(address), wanted, count=count)
+        return self._run_command(
+            _READ, f"READ at {address:#x}", _encode_address(address), wanted, count=count
+        )
 
     def write(self, address: int, data: bytes) -> None:
-        """Up to 256 bytes, a multiple of four, into erased flash."""
-        body = _checked(bytes([len(data) - 1]) + data)
-        self._command(_WRITE, f"WRITE at {address:#x}", _place(address), body)
+        """Write up to 256 bytes, a multiple of four, into erased flash."""
+        body = _append_checksum(bytes([len(data) - 1]) + data)
+        self._run_command(_WRITE, f"WRITE at {address:#x}", _encode_address(address), body)
 
     def verify(self, address: int, data: bytes) -> None:
-        """Read up to 256 bytes back.
+        """Read up to 256 bytes back and compare them.
 
         Raises:
             VerifyError: The flash holds something else.
@@ -155,16 +156,18 @@ class RomLoader:
 
     def erase(self, sectors: Sequence[int]) -> None:
         """Erase sectors."""
-        body = _checked(b"".join(number.to_bytes(2, "big") for number in (len(sectors) - 1, *sectors)))
+        body = _append_checksum(
+            b"".join(number.to_bytes(2, "big") for number in (len(sectors) - 1, *sectors))
+        )
         what = f"ERASE of sectors {', '.join(map(str, sectors))}"
-        self._command(_ERASE, what, body, timeout_s=_ANSWER_S + 2.0 * len(sectors))
+        self._run_command(_ERASE, what, body, timeout_s=_ANSWER_S + 2.0 * len(sectors))
 
-    def go(self, address: int) -> None:
-        """Run what stands there."""
-        self._command(_GO, f"GO to {address:#x}", _place(address))
+    def run_program(self, address: int) -> None:
+        """Run the program at an address."""
+        self._run_command(_GO, f"GO to {address:#x}", _encode_address(address))
 
     def has_brown_out(self) -> bool | None:
-        """Whether the option bytes have the part reset below 2.1 V, or above that; None: it does not say."""
+        """Whether the option bytes set a brown-out reset at 2.1 V or more; None if they cannot be read."""
         try:
             # level 3 is off but for 1.7 V, 0 resets below 2.7 V
             return self.read(_OPTIONS, 4)[0] & _BROWN_OUT != _BROWN_OUT
@@ -172,27 +175,26 @@ class RomLoader:
             return None
 
     def set_brown_out(self) -> None:
-        """Have the part reset below 2.7 V; it resets now, to take that."""
+        """Set the brown-out reset to 2.7 V; the part resets at once."""
         options = bytearray(self.read(_OPTIONS, 16))
         options[0] &= ~_BROWN_OUT & 0xFF
         self.write(_OPTIONS, bytes(options))
 
 
 class _FailedError(Exception):
-    """A part of a command that was not answered, or refused."""
+    """A part of a command was not answered, or refused."""
 
     def __init__(self, silent: bool) -> None:
         super().__init__()
         self.silent = silent
 
 
-def _checked(data: bytes) -> bytes:
-    """Bytes and their check sum."""
+def _append_checksum(data: bytes) -> bytes:
     return data + bytes([reduce(xor, data)])
 
 
-def _place(address: int) -> bytes:
-    return _checked(address.to_bytes(4, "big"))
+def _encode_address(address: int) -> bytes:
+    return _append_checksum(address.to_bytes(4, "big"))
 
 
 def flash_image(
@@ -202,7 +204,7 @@ def flash_image(
     start: bool = True,
     progress: Progress | None = None,
 ) -> list[int]:
-    """Erase the sectors of an image, write it, read it back, and run it; gives the sectors.
+    """Erase the sectors of an image, write it, read it back, and run it; return the sectors.
 
     Other sectors, such as those of SAVE, stay as they are.
 
@@ -211,7 +213,7 @@ def flash_image(
         VerifyError: The flash does not hold what was sent.
         LineError: The line fails.
     """
-    product = loader.product()
+    product = loader.read_product()
     if product != PRODUCT:
         raise RefusedError(
             f"{loader.line.name}: the part says {product:#x}, expected {PRODUCT:#x}, an STM32F405", _NACK
@@ -223,14 +225,14 @@ def flash_image(
     total, done = len(data) * (2 if verify else 1), 0
     pieces = [(image.address + at, data[at : at + _PIECE]) for at in range(0, len(data), _PIECE)]
     loader.erase(sectors)
-    for do in (loader.write, loader.verify)[: 1 + verify]:
+    for transfer in (loader.write, loader.verify)[: 1 + verify]:
         for at, piece in pieces:
             if progress is not None:
                 progress(done, total)
-            do(at, piece)
+            transfer(at, piece)
             done += len(piece)
     if progress is not None:
         progress(done, total)
     if start:
-        loader.go(image.address)
+        loader.run_program(image.address)
     return sectors

@@ -1,4 +1,4 @@
-"""Serial ports by pyserial, and what to do about one that cannot be opened."""
+"""Serial ports by pyserial, and advice if one cannot be opened."""
 
 import contextlib
 import errno
@@ -7,23 +7,24 @@ from typing import Any
 
 from firmware_host.errors import LineError, NoBoardError
 
-_MISSING = "it is not there; plug it in, or find it with 'evlcp board ports'"
-_DENIED = "no permission: join its group, which 'ls -l {}' names: 'sudo usermod -aG GROUP USER', log in again"
-_TAKEN = "another program has it open; 'sudo fuser -v {}' says which"
+_ABSENT_ADVICE = "it is not there; plug it in, or find it with 'evlcp board ports'"
+_DENIED_ADVICE = (
+    "no permission: join its group, which 'ls -l {}' names: 'sudo usermod -aG GROUP USER', log in again"
+)
+_BUSY_ADVICE = "another program has it open; 'sudo fuser -v {}' says which"
 _ADVICE: dict[int | None, str] = {
-    **dict.fromkeys((errno.ENOENT, errno.ENXIO, errno.ENODEV), _MISSING),
-    **dict.fromkeys((errno.EACCES, errno.EPERM), _DENIED),
-    **dict.fromkeys((errno.EBUSY, errno.EAGAIN), _TAKEN),
+    **dict.fromkeys((errno.ENOENT, errno.ENXIO, errno.ENODEV), _ABSENT_ADVICE),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), _DENIED_ADVICE),
+    **dict.fromkeys((errno.EBUSY, errno.EAGAIN), _BUSY_ADVICE),
 }
-"""What to do about a device that cannot be opened."""
+"""Advice for a device that cannot be opened, by errno."""
 
 
 class SerialTransport:
     """Anything that pyserial opens: a device, `socket://`, `rfc2217://`, `loop://` and so on.
 
-    What its drivers raise differs from one platform to the next (`termios.error` is no `OSError`), and a port
-    that another thread closes under a read raises `TypeError` or `AttributeError`: all of it is the line that
-    broke.
+    Drivers raise different errors on each platform (`termios.error` is no `OSError`), and a port that another
+    thread closes during a read raises `TypeError` or `AttributeError`: each means that the line broke.
 
     Raises:
         NoBoardError: It cannot be opened.
@@ -43,9 +44,9 @@ class SerialTransport:
                 url, baudrate=baud, timeout=self._SLICE_S, write_timeout=5.0, **options
             )
         except Exception as fault:
-            raise NoBoardError(f"{url}: cannot be opened: {_why(url, baud, fault)}") from fault
+            raise NoBoardError(f"{url}: cannot be opened: {_explain_open_fault(url, baud, fault)}") from fault
 
-    def now(self) -> float:
+    def time_s(self) -> float:
         """Monotonic time, s."""
         return time.monotonic()
 
@@ -58,38 +59,41 @@ class SerialTransport:
                 if data or time.monotonic() >= end:
                     return data
         except Exception as fault:
-            raise self._broken(fault) from fault
+            raise self._line_error(fault) from fault
 
     def write(self, data: bytes) -> None:
         """See `Transport.write`."""
         try:
             self._port.write(data)
         except Exception as fault:
-            raise self._broken(fault) from fault
+            raise self._line_error(fault) from fault
 
     def close(self) -> None:
-        """Close the port; one that is gone is closed."""
+        """Close the port; errors of one that is gone are ignored."""
         with contextlib.suppress(Exception):
             self._port.close()
 
-    def _broken(self, fault: Exception) -> LineError:
-        return LineError(f"{self.name}: the line broke: {_text(fault)}; plug it in and run the command again")
+    def _line_error(self, fault: Exception) -> LineError:
+        return LineError(
+            f"{self.name}: the line broke: {_describe_fault(fault)}; plug it in and run the command again"
+        )
 
 
-def _text(fault: BaseException) -> str:
+def _describe_fault(fault: BaseException) -> str:
     return " ".join(str(fault).split()) or type(fault).__name__
 
 
-def _why(url: str, baud: int, fault: Exception) -> str:
-    """Why a port cannot be opened, and what to do."""
+def _explain_open_fault(url: str, baud: int, fault: Exception) -> str:
+    """The reason why a port cannot be opened, with advice."""
     scheme, on_network, _ = url.partition("://")
     if scheme in ("socket", "rfc2217"):
         return (
-            f"{_text(fault)}; expected {scheme}://HOST:PORT; start what listens there, or name another --port"
+            f"{_describe_fault(fault)}; expected {scheme}://HOST:PORT; start what listens there, or name"
+            " another --port"
         )
     advice = _ADVICE.get(getattr(fault, "errno", None))
     if advice is not None and not on_network:
         return advice.format(url)
     if "baud" in str(fault).lower():
-        return f"{_text(fault)}: its driver does not take --baud {baud}"
-    return f"{_text(fault)}; 'evlcp board ports' lists the ports"
+        return f"{_describe_fault(fault)}: its driver does not take --baud {baud}"
+    return f"{_describe_fault(fault)}; 'evlcp board ports' lists the ports"

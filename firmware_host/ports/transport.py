@@ -19,7 +19,7 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.files import open_log, read_bytes, writing
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.ports.serial_port import SerialTransport
-from firmware_host.ports.usb import device_of
+from firmware_host.ports.usb import find_usb_device
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
 _NETWORK = ("unix:", "tcp:", "socket://", "rfc2217://")
@@ -54,17 +54,17 @@ class Transport(Protocol):
     """A byte line and the clock that its time-outs follow.
 
     Attributes:
-        name: What to call it in messages.
+        name: Its name in messages.
     """
 
     name: str
 
-    def now(self) -> float:
-        """The time, s: monotonic, but for a line of its own time."""
+    def time_s(self) -> float:
+        """The monotonic clock, s; a simulated line has its own."""
         return time.monotonic()
 
     def read(self, timeout_s: float) -> bytes:
-        """Bytes that came, after at most `timeout_s`; empty if none did.
+        """The received bytes, after at most `timeout_s`; empty if there are none.
 
         Raises:
             LineError: The line went away.
@@ -78,7 +78,7 @@ class Transport(Protocol):
         """
 
     def close(self) -> None:
-        """Let go of the line."""
+        """Release the line."""
 
 
 class SocketTransport(Transport):
@@ -94,7 +94,7 @@ class SocketTransport(Transport):
         """Connect to `unix:PATH` or `tcp:HOST:PORT`.
 
         Raises:
-            NoBoardError: Nobody listens there, or it is no such place.
+            NoBoardError: Nobody listens there, or the address is invalid.
         """
         try:
             address = socket_address(spec)
@@ -149,7 +149,7 @@ class SocketTransport(Transport):
 class TraceTransport(Transport):
     """Passes everything through and records it as JSON lines.
 
-    The first line has port, line rate and what the client drew at random; each further one is
+    The first line has port, line rate and the client's random numbers; each further one is
     `{"t": seconds, "dir": "tx" | "rx", "hex": bytes}`.
 
     Raises:
@@ -161,31 +161,31 @@ class TraceTransport(Transport):
         self._inner = inner
         self._path = path
         self._file = open_log(path)
-        self._start = inner.now()
-        self._put({"evlcp_trace": 1, "port": inner.name, "baud": baud, "first": first, "nonce": nonce})
+        self._start = inner.time_s()
+        self._write_line({"evlcp_trace": 1, "port": inner.name, "baud": baud, "first": first, "nonce": nonce})
 
-    def _put(self, line: Mapping[str, Any]) -> None:
+    def _write_line(self, line: Mapping[str, Any]) -> None:
         with writing(self._path):
             self._file.write(json.dumps(line) + "\n")
 
-    def _note(self, direction: str, data: bytes) -> None:
+    def _record(self, direction: str, data: bytes) -> None:
         if data:
-            t = round(self._inner.now() - self._start, 6)
-            self._put({"t": t, "dir": direction, "hex": data.hex()})
+            t = round(self._inner.time_s() - self._start, 6)
+            self._write_line({"t": t, "dir": direction, "hex": data.hex()})
 
-    def now(self) -> float:
+    def time_s(self) -> float:
         """The inner line's time, s."""
-        return self._inner.now()
+        return self._inner.time_s()
 
     def read(self, timeout_s: float) -> bytes:
         """See `Transport.read`."""
         data = self._inner.read(timeout_s)
-        self._note("rx", data)
+        self._record("rx", data)
         return data
 
     def write(self, data: bytes) -> None:
         """See `Transport.write`."""
-        self._note("tx", data)
+        self._record("tx", data)
         self._inner.write(data)
 
     def close(self) -> None:
@@ -196,7 +196,7 @@ class TraceTransport(Transport):
 
 
 class ReplayTransport(Transport):
-    """Plays a trace back: gives what was received, once what was sent before it has been sent again.
+    """Plays a trace back: each received piece comes after those that were sent before it.
 
     Args:
         path: A file that `TraceTransport` wrote.
@@ -223,22 +223,22 @@ class ReplayTransport(Transport):
                 self._events.append((float(event["t"]), event["dir"], bytes.fromhex(event["hex"])))
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as fault:
             raise InputError(f"{path}: line {number}: not a trace of the wire: {fault!r}") from fault
-        self._now = 0.0
+        self._time_s = 0.0
         self._sent = 0
 
-    def now(self) -> float:
-        """Time of the trace, s."""
-        return self._now
+    def time_s(self) -> float:
+        """Time in the trace, s."""
+        return self._time_s
 
     def read(self, timeout_s: float) -> bytes:
-        """What was received here in the trace; else time passes."""
+        """The next received piece of the trace; while one to send is due, time passes."""
         if self._events and self._events[0][1] == "rx":
             at, _, data = self._events.popleft()
-            self._now = max(self._now, at)
+            self._time_s = max(self._time_s, at)
             return data
         if not self._events:
             raise LineError(f"{self.name}: the trace ends here; record it again with --trace")
-        self._now += timeout_s
+        self._time_s += timeout_s
         return b""
 
     def write(self, data: bytes) -> None:
@@ -255,18 +255,18 @@ class ReplayTransport(Transport):
                     f"{self.name}: byte {self._sent} sent is another one than was recorded;"
                     " replay the command, the options and the files that were"
                 )
-            self._now = max(self._now, at)
+            self._time_s = max(self._time_s, at)
             data = data[n:]
             self._sent += n
             if n < len(expected):
                 self._events.appendleft((at, "tx", expected[n:]))
 
     def close(self) -> None:
-        """Nothing to let go."""
+        """Nothing to release."""
 
 
 def open_transport(spec: str, baud: int = DEFAULT_BAUD, even_parity: bool = False) -> Transport:
-    """Open a port by its name; see the module. `firmware_host.emulators.opening` opens emulators, too.
+    """Open a port by its name, as above; `firmware_host.emulators.opening` opens emulators, too.
 
     Raises:
         NoBoardError: It cannot be opened.
@@ -274,4 +274,4 @@ def open_transport(spec: str, baud: int = DEFAULT_BAUD, even_parity: bool = Fals
     scheme, _, rest = spec.partition(":")
     if scheme in ("unix", "tcp"):
         return SocketTransport.connect(spec)
-    return SerialTransport(device_of(rest) if scheme == "usb" else spec, baud, even_parity)
+    return SerialTransport(find_usb_device(rest) if scheme == "usb" else spec, baud, even_parity)

@@ -13,7 +13,7 @@ BRIDGES = (
     *("1a86:55d4", "1a86:7523"),  # WCH CH9102, CH340
     "2e8a:000c",  # Raspberry Pi Debug Probe
 )
-"""USB ids of the bridges that boards usually have: unless told otherwise, only these ports are written to."""
+"""USB ids of the bridges that boards usually have; by default only these ports are written to."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class SerialPort:
 
     Attributes:
         device: Name to give to `--port`.
-        description: What the operating system says of it.
+        description: The operating system's description.
         usb: USB id `vvvv:pppp` in hex, or None.
         serial_number: The USB device's serial number, or None.
     """
@@ -33,8 +33,8 @@ class SerialPort:
     serial_number: str | None = None
 
     @property
-    def likely(self) -> bool:
-        """Whether it is a bridge that boards usually have."""
+    def has_common_bridge(self) -> bool:
+        """Whether its USB id is that of a bridge that boards usually have."""
         return self.usb in BRIDGES
 
 
@@ -43,9 +43,9 @@ class UsbFilter:
     """USB devices by id and serial number.
 
     Attributes:
-        parts: Vendor and product id, four hex digits each, and serial number; as many as are given.
+        parts: Vendor id, product id, four hex digits each, and serial number; the later ones are optional.
 
-    >>> UsbFilter.parse("0403:6015:D30A1").takes(SerialPort("COM7", "", "0403:6015", "D30A1"))
+    >>> UsbFilter.parse("0403:6015:D30A1").matches(SerialPort("COM7", "", "0403:6015", "D30A1"))
     True
     """
 
@@ -64,7 +64,7 @@ class UsbFilter:
         vendor, product, serial = found.groups("")
         return cls(tuple(part for part in (vendor.lower(), product.lower(), serial) if part))
 
-    def takes(self, port: SerialPort) -> bool:
+    def matches(self, port: SerialPort) -> bool:
         """Whether a port is one of these."""
         found = (*(port.usb or "").split(":"), port.serial_number)
         return found[: len(self.parts)] == self.parts
@@ -88,7 +88,7 @@ def serial_ports() -> list[SerialPort]:
     )
 
 
-def device_of(text: str) -> str:
+def find_usb_device(text: str) -> str:
     """The device of the one serial port with a USB id, `VID`, `VID:PID` or `VID:PID:SERIAL`.
 
     Raises:
@@ -96,7 +96,7 @@ def device_of(text: str) -> str:
         NoBoardError: There is none, or there are several.
     """
     wanted = UsbFilter.parse(text)
-    found = [port for port in serial_ports() if wanted.takes(port)]
+    found = [port for port in serial_ports() if wanted.matches(port)]
     if len(found) == 1:
         return found[0].device
     if not found:

@@ -1,7 +1,7 @@
 """The host's end of the protocol as a state machine without I/O: window, time-outs, tries, sessions.
 
-The caller moves bytes and time: `submit` requests, hand what was read to `receive`, write what `poll` gives,
-and come back before its deadline.
+The caller moves bytes and time: it submits requests, passes received bytes to `receive`, writes the bytes of
+`poll`, and polls again before the deadline.
 """
 
 import random
@@ -17,29 +17,28 @@ from firmware_host.protocol.seal import Sealer
 from firmware_host.protocol.wire import WireMessage, WireRequest
 
 TRIES = 5
-"""How often a request is sent before it is given up, unless the caller says otherwise."""
-
+"""Default number of times that a request is sent."""
 
 BACKOFF = 2.0
-"""Factor by which each further try waits longer."""
+"""Factor by which each further try waits longer for its answer."""
 
 MOST_LATENCY_S = 10.0
-"""The most that a measured latency makes a request wait for its first answer, s."""
+"""Largest latency that counts, if the measured one is larger, s."""
 
 SLOW_S = 0.1
-"""A board whose answers are later than that gets requests one at a time, s; a USB bridge's take 16 ms."""
+"""Latency above which a board gets requests one at a time, s; a USB bridge's is 16 ms."""
 
 MOST_PATIENCE = 32.0
-"""The most by which requests that were sent again make the next one wait longer."""
+"""Largest factor by which repeated requests lengthen the wait of the next ones."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """How long an answer may take.
+    """The time that an answer may take.
 
     Attributes:
         baud: Line rate, bit/s; a byte takes ten bits.
-        latency_s: What board and host operating system add, s.
+        latency_s: Latency of board and host operating system, s.
 
     >>> Timing(1_000_000).wire_s(200)
     0.002
@@ -49,20 +48,20 @@ class Timing:
     latency_s: float = 0.1
 
     def wire_s(self, count: int) -> float:
-        """Time that `count` bytes take on the line, s."""
+        """Duration of `count` bytes on the line, s."""
         return 10.0 * count / self.baud
 
 
 @dataclass(frozen=True, slots=True)
 class RequestOutcome:
-    """How a request ended.
+    """The result of a request.
 
     Attributes:
-        token: What `submit` returned for it.
-        status: The board's status, or None if no answer came.
+        token: The request's, from `submit`.
+        status: The board's status, or None without an answer.
         reply: The answer, if the status is OK.
-        detail: Number that goes with another status.
-        tries: How often it was sent.
+        detail: The number that explains another status.
+        tries: Number of times that the request was sent.
     """
 
     token: int
@@ -73,7 +72,7 @@ class RequestOutcome:
 
 
 @dataclass(slots=True)
-class _Waiting:
+class _PendingRequest:
     token: int
     type: int
     wire: bytes
@@ -88,18 +87,18 @@ class _Waiting:
 class Client:
     """Requests in, outcomes out; between them bytes and time.
 
-    What answers take beyond their time on the line is measured, as TCP does (RFC 6298): a slow board gets
-    longer than `timing` says, never less.
+    The latency of answers is measured as in TCP (RFC 6298): a slow board gets more time than by `timing`,
+    never less.
 
     Args:
-        timing: How long an answer may take.
-        window: Requests under way at once; HELLO says how many the board takes.
-        session: Session that HELLO gave.
-        sealer: Seals requests of the session; None where the board has no key, or this host has not.
-        minor: Minor version of the protocol in which requests are sent: the board's, that HELLO gave.
-        first: First sequence number, by default drawn at random.
-        tries: How often a request is sent before it is given up.
-        retries: Counts the requests sent again.
+        timing: The time that an answer may take.
+        window: Requests in flight at once, as the board's HELLO allows.
+        session: The session, from HELLO.
+        sealer: Seals requests of the session; None if the board or this host has no key.
+        minor: Minor version of the protocol for requests: the board's, from HELLO.
+        first: First sequence number, by default random.
+        tries: Number of times that a request is sent.
+        retries: Number of requests that were sent again.
 
     >>> from firmware_host.protocol.generated.requests import StatusRequest
     >>> client = Client(Timing())
@@ -119,10 +118,10 @@ class Client:
     retries: int = 0
     decoder: DatagramDecoder = field(default_factory=DatagramDecoder)
     _tokens: int = 0
-    _queue: deque[_Waiting] = field(default_factory=deque)
-    _flight: dict[int, _Waiting] = field(default_factory=dict)
+    _queue: deque[_PendingRequest] = field(default_factory=deque)
+    _in_flight: dict[int, _PendingRequest] = field(default_factory=dict)
     _outcomes: list[RequestOutcome] = field(default_factory=list)
-    _now: float = 0.0
+    _time_s: float = 0.0
     _mean_s: float | None = None
     _spread_s: float = 0.0
     _patience: float = 1.0
@@ -130,31 +129,31 @@ class Client:
 
     @property
     def latency_s(self) -> float:
-        """What an answer may take beyond its time on the line, s; `timing` says at least how much."""
+        """Time that an answer may take beyond its time on the line, at least that of `timing`, s."""
         measured = min((self._mean_s or 0.0) + 4 * self._spread_s, MOST_LATENCY_S)
         return max(self.timing.latency_s, measured) * self._patience
 
-    def _may_go(self, waiting: _Waiting) -> bool:
-        """Whether a request may go out beside those under way.
+    def _can_send(self, pending: _PendingRequest) -> bool:
+        """Whether a request may be sent while others are in flight.
 
-        What waits for its turn at a slow board would be sent again before: it gets one at a time, and of one
-        whose short answers are late already the first long one is waited for.
+        A request that waits for its turn at a slow board would be sent again too early: such a board gets one
+        at a time, and one whose short answers are late gets its first long request alone.
         """
-        if not self._flight:
+        if not self._in_flight:
             return True
         late_s = self._mean_s or 0.0
-        alone = late_s > SLOW_S or (late_s > SLOW_S / 4 and len(waiting.wire) > 2 * self._largest)
-        return not alone and len(self._flight) < self.window
+        alone = late_s > SLOW_S or (late_s > SLOW_S / 4 and len(pending.wire) > 2 * self._largest)
+        return not alone and len(self._in_flight) < self.window
 
-    def _measure(self, waiting: _Waiting) -> None:
-        """Take in how long an answer took; if its request was sent again, it may be to any of these."""
-        if waiting.tries > 1:
-            # until one is answered at its first try, as long as this one needed
-            self._patience = min(self._patience * BACKOFF ** (waiting.tries - 1), MOST_PATIENCE)
+    def _measure_latency(self, pending: _PendingRequest) -> None:
+        """Update the latency; after several tries it is unknown to which the answer belongs."""
+        if pending.tries > 1:
+            # kept until a request is answered at its first try
+            self._patience = min(self._patience * BACKOFF ** (pending.tries - 1), MOST_PATIENCE)
             return
         self._patience = 1.0
-        self._largest = max(self._largest, len(waiting.wire))
-        late_s = max(0.0, self._now - waiting.sent - waiting.wire_s)
+        self._largest = max(self._largest, len(pending.wire))
+        late_s = max(0.0, self._time_s - pending.sent - pending.wire_s)
         if self._mean_s is None:
             self._mean_s, self._spread_s = late_s, late_s / 2
         else:
@@ -162,7 +161,7 @@ class Client:
             self._mean_s += (late_s - self._mean_s) / 8
 
     def submit(self, request: WireRequest[Any]) -> int:
-        """Queue a request; returns the token its outcome will carry."""
+        """Queue a request; return the token of its outcome."""
         sequence = (self.first + self._tokens) & 0xFFFF
         token, payload, status = self._tokens, request.pack(self.minor), 0
         if self.sealer is not None and self.session != protocol.NO_SESSION:
@@ -170,83 +169,85 @@ class Client:
             status = SEALED
         wire = Datagram(request.TYPE, status, sequence, self.session, payload).encode()
         reply = REPLIES[request.TYPE]
-        longest = protocol.MAX_PAYLOAD if reply.takes_more() else max(4, reply.fixed_bytes())
+        longest = protocol.MAX_PAYLOAD if reply.is_open_ended() else max(4, reply.min_bytes())
         self._tokens += 1
         self._queue.append(
-            _Waiting(token, request.TYPE, wire, longest + protocol.HEADER_BYTES + protocol.CRC_BYTES + 4)
+            _PendingRequest(
+                token, request.TYPE, wire, longest + protocol.HEADER_BYTES + protocol.CRC_BYTES + 4
+            )
         )
         return token
 
     @property
-    def room(self) -> bool:
-        """Whether one more request would go out at once."""
-        return len(self._queue) + len(self._flight) < self.window
+    def has_room(self) -> bool:
+        """Whether one more request would be sent at once."""
+        return len(self._queue) + len(self._in_flight) < self.window
 
-    def forget(self) -> None:
-        """Drop everything queued and under way; late answers will be ignored."""
+    def drop_requests(self) -> None:
+        """Drop all requests, queued or in flight; late answers will be ignored."""
         self._queue.clear()
-        self._flight.clear()
+        self._in_flight.clear()
 
-    def receive(self, data: bytes, now: float | None = None) -> list[RequestOutcome]:
-        """Take what was read from the line, at a time; give what it settles."""
-        self._now = self._now if now is None else now
+    def receive(self, data: bytes, time_s: float | None = None) -> list[RequestOutcome]:
+        """Take bytes that were received at a time, s; return the outcomes of requests."""
+        self._time_s = self._time_s if time_s is None else time_s
         for datagram in self.decoder.feed(data):
-            waiting = self._flight.get(datagram.sequence)
-            if waiting is None or datagram.type != waiting.type | protocol.REPLY_BIT:
+            pending = self._in_flight.get(datagram.sequence)
+            if pending is None or datagram.type != pending.type | protocol.REPLY_BIT:
                 continue
-            outcome = _outcome(waiting, datagram)
+            outcome = _parse_outcome(pending, datagram)
             if outcome is not None:
-                del self._flight[datagram.sequence]
-                self._measure(waiting)
+                del self._in_flight[datagram.sequence]
+                self._measure_latency(pending)
                 self._outcomes.append(outcome)
         done, self._outcomes = self._outcomes, []
         return done
 
-    def poll(self, now: float) -> tuple[bytes, float | None]:
-        """Bytes to write now, and the time by which to come back (None if nothing is under way).
+    def poll(self, time_s: float) -> tuple[bytes, float | None]:
+        """Bytes to write now, and the time of the next poll, s (None if nothing is in flight).
 
-        Requests that have had all their tries are settled without a status; `receive` gives them.
+        The outcomes of requests without an answer after all tries come from the next `receive`.
         """
         out = []
-        self._now = now
-        while self._queue and self._may_go(self._queue[0]):
-            waiting = self._queue.popleft()
-            self._flight[(self.first + waiting.token) & 0xFFFF] = waiting
-            out.append(self._send(waiting, now))
-        for sequence, waiting in list(self._flight.items()):
-            if waiting.due > now:
+        self._time_s = time_s
+        while self._queue and self._can_send(self._queue[0]):
+            pending = self._queue.popleft()
+            self._in_flight[(self.first + pending.token) & 0xFFFF] = pending
+            out.append(self._send(pending, time_s))
+        for sequence, pending in list(self._in_flight.items()):
+            if pending.due > time_s:
                 continue
-            if waiting.tries >= self.tries:
-                del self._flight[sequence]
-                self._outcomes.append(RequestOutcome(waiting.token, None, None, 0, waiting.tries))
+            if pending.tries >= self.tries:
+                del self._in_flight[sequence]
+                self._outcomes.append(RequestOutcome(pending.token, None, None, 0, pending.tries))
             else:
                 self.retries += 1
-                out.append(self._send(waiting, now))
+                out.append(self._send(pending, time_s))
         if self._outcomes:
-            return b"".join(out), now
-        return b"".join(out), min((w.due for w in self._flight.values()), default=None)
+            return b"".join(out), time_s
+        return b"".join(out), min((w.due for w in self._in_flight.values()), default=None)
 
-    def _send(self, waiting: _Waiting, now: float) -> bytes:
-        queued = sum(len(w.wire) for w in self._flight.values())
-        replies = sum(w.reply_bytes for w in self._flight.values())
-        waiting.wire_s = 2 * self.timing.wire_s(queued + replies)
-        waiting.due = now + (waiting.wire_s + self.latency_s) * BACKOFF**waiting.tries
-        waiting.sent = now
-        waiting.tries += 1
-        return waiting.wire
+    def _send(self, pending: _PendingRequest, time_s: float) -> bytes:
+        queued = sum(len(w.wire) for w in self._in_flight.values())
+        replies = sum(w.reply_bytes for w in self._in_flight.values())
+        pending.wire_s = 2 * self.timing.wire_s(queued + replies)
+        pending.due = time_s + (pending.wire_s + self.latency_s) * BACKOFF**pending.tries
+        pending.sent = time_s
+        pending.tries += 1
+        return pending.wire
 
 
-def _outcome(waiting: _Waiting, datagram: Datagram) -> RequestOutcome | None:
-    """The outcome, or None if the payload is not the reply's (then a further try decides)."""
+def _parse_outcome(pending: _PendingRequest, datagram: Datagram) -> RequestOutcome | None:
+    """The outcome by a datagram, or None if the payload is invalid, so that the request is tried again."""
     if datagram.status == Status.OK:
         try:
-            reply = REPLIES[waiting.type].unpack(datagram.payload)
+            reply = REPLIES[pending.type].unpack(datagram.payload)
         except DatagramError:
             return None
-        return RequestOutcome(waiting.token, Status.OK, reply, 0, waiting.tries)
+        return RequestOutcome(pending.token, Status.OK, reply, 0, pending.tries)
     detail = int.from_bytes(datagram.payload[:4], "little")
     try:
         status: Status | int = Status(datagram.status)
     except ValueError:
         status = datagram.status
-    return RequestOutcome(waiting.token, status, None, detail, waiting.tries)
+    return RequestOutcome(pending.token, status, None, detail, pending.tries)

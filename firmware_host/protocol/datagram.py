@@ -27,9 +27,9 @@ class Datagram:
 
     Attributes:
         type: Request type; bit 7 is set in a reply.
-        status: 0 in a request; how it ended in a reply.
+        status: 0 in a request, the result in a reply.
         sequence: Number of the request, 0 to 65535.
-        session: Session that HELLO gave.
+        session: The session, from HELLO.
         payload: Bytes of the message.
 
     >>> Datagram.decode(Datagram(0x0C, 0, 7, 1, b"").encode()[:-1]).sequence
@@ -43,7 +43,7 @@ class Datagram:
     payload: bytes
 
     def encode(self) -> bytes:
-        """Bytes on the wire, delimiter included.
+        """The datagram on the wire, with its delimiter.
 
         Raises:
             DatagramError: The payload is longer than the protocol allows.
@@ -55,10 +55,10 @@ class Datagram:
 
     @classmethod
     def decode(cls, wire: bytes) -> "Datagram":
-        """Read the bytes between two delimiters.
+        """A datagram from the bytes between two delimiters.
 
         Raises:
-            DatagramError: They are not a datagram: COBS, length or CRC is wrong.
+            DatagramError: COBS, length or CRC is wrong.
         """
         try:
             body = cobs.decode(wire)
@@ -73,7 +73,7 @@ class Datagram:
 
 @dataclass(slots=True)
 class DatagramDecoder:
-    """Bytes in any portions -> datagrams; what is none is dropped, and its request sent again.
+    """Decodes datagrams from bytes in any portions; invalid ones are dropped, as their requests are repeated.
 
     >>> wire = Datagram(0x0C, 0, 7, 1, b"").encode()
     >>> decoder = DatagramDecoder()
@@ -83,22 +83,22 @@ class DatagramDecoder:
     [Datagram(type=12, ...)]
     """
 
-    _open: bytearray = field(default_factory=bytearray)
-    _skip: bool = False
+    _partial: bytearray = field(default_factory=bytearray)
+    _is_skipping: bool = False
 
     def feed(self, data: bytes) -> list[Datagram]:
-        """Take bytes from the wire; give the datagrams that they complete."""
+        """Take bytes from the wire; return the datagrams that they complete."""
         found = []
         *ended, rest = data.split(b"\0")
         for part in ended:
-            self._open += part
-            if self._open and not self._skip:
+            self._partial += part
+            if self._partial and not self._is_skipping:
                 with contextlib.suppress(DatagramError):
-                    found.append(Datagram.decode(bytes(self._open)))
-            self._open.clear()
-            self._skip = False
-        self._open += rest
-        if len(self._open) > MAX_WIRE_BYTES:
-            self._skip = True
-            self._open.clear()
+                    found.append(Datagram.decode(bytes(self._partial)))
+            self._partial.clear()
+            self._is_skipping = False
+        self._partial += rest
+        if len(self._partial) > MAX_WIRE_BYTES:
+            self._is_skipping = True
+            self._partial.clear()
         return found

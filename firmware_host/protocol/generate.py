@@ -1,6 +1,6 @@
-"""Writes the C headers and the Python module that `protocol.toml` and the codebook define.
+"""Generates C headers, Python modules and a page of the docs from `protocol.toml` and the codebook.
 
-`python -m firmware_host.protocol.generate` writes them; `--check` only says which are stale and ends with 1.
+`python -m firmware_host.protocol.generate` writes them; `--check` only names stale ones and ends with 1.
 """
 
 import argparse
@@ -24,13 +24,13 @@ _BASES = {
     "i16": ("h", 2, "int16_t"),
     "bytes": ("s", 1, "uint8_t"),
 }
-"""Types of an element: their `struct` code, bytes, and C type."""
+"""Element types: `struct` code, bytes, and C type."""
 
 Table = dict[str, Any]
 
 
-def _field(table: Table) -> Table:
-    """A field of a payload, with what templates need of it; its count is 0 for the rest of the payload."""
+def _expand_field(table: Table) -> Table:
+    """A field of a payload with its derived values for templates; the count of the payload's rest is 0."""
     base, _, number = table["type"].removesuffix("]").partition("[")
     code, size, c_type = _BASES[base]
     count = int(number) if number else int(base != "bytes")
@@ -49,14 +49,14 @@ def _field(table: Table) -> Table:
         "bits": 8 * size,
         "c_type": c_type,
         "python_type": python,
-        # what stands for it where it is not known
+        # its value if an earlier version lacks it
         "python_default": f' = field(default={absent}, metadata={{"since": {since}}})' if since else "",
     }
 
 
-def _message(table: Table) -> Table:
-    """A request and its reply, with what templates need of them."""
-    parts = {part: [_field(f) for f in table[part]] for part in ("request", "reply")}
+def _expand_message(table: Table) -> Table:
+    """A request and its reply with their derived values for templates."""
+    parts = {part: [_expand_field(f) for f in table[part]] for part in ("request", "reply")}
     for fields in parts.values():
         if [f["since"] for f in fields] != sorted(f["since"] for f in fields):
             raise ValueError(f"message {table['name']}: a field with `since` stands before one without")
@@ -68,19 +68,19 @@ def _message(table: Table) -> Table:
         **table,
         **parts,
         "request_bytes": sum(f["size"] for f in request),
-        # the board leaves alone what a later host adds to HELLO
+        # the board ignores fields that a later host adds to HELLO
         "takes_more": table["kind"] == "session" or not all(f["size"] for f in request),
     }
 
 
 _CLASSES = {"fault": "BoardFault"}
-"""Classes whose name is not that of their definition, which the SDK has for something else."""
+"""Class names that differ from their definition, as the SDK uses that name for something else."""
 
 _NUMBERS = {
     "protocol": ("header_bytes", "crc_bytes", "max_payload", "window", "default_baud"),
     "geometry": ("clusters", "leds", "row_bytes"),
 }
-"""Numbers of the definition that are constants of the Python module."""
+"""Numbers of the definition that become constants of the Python module."""
 
 
 def _camel(name: str) -> str:
@@ -102,11 +102,11 @@ def _fields_table(message: Table, major: int) -> str:
             type_ = f["type"] if f["size"] else "bytes to the end"
             later = f" Since {major}.{f['since']}." if f["since"] else ""
             rows.append(("" if n else kind, f["name"], type_, f["doc"] + later))
-    return _columns(rows)
+    return _align_columns(rows)
 
 
 def _numbers_table(enum: Table) -> str:
-    return _columns([(str(e["value"]), k.upper(), e["doc"]) for k, e in enum.items() if k != "doc"])
+    return _align_columns([(str(e["value"]), k.upper(), e["doc"]) for k, e in enum.items() if k != "doc"])
 
 
 _TEMPLATES = Environment(
@@ -131,15 +131,15 @@ def render(template: str, definition: Table) -> str:
     Raises:
         ValueError: The definition contradicts itself.
     """
-    messages = [_message(table) for table in definition["message"]]
+    messages = [_expand_message(table) for table in definition["message"]]
     numbers = [(key.upper(), definition[part][key]) for part, keys in _NUMBERS.items() for key in keys]
     return _TEMPLATES.get_template(f"{template}.j2").render(
         definition,
         messages=messages,
         numbers=numbers,
-        stored=[(t["name"], t["doc"], [_field(f) for f in t["fields"]]) for t in definition["stored"]],
+        stored=[(t["name"], t["doc"], [_expand_field(f) for f in t["fields"]]) for t in definition["stored"]],
         digests={
-            # those that the firmware is built with: of the default link with another profile
+            # the firmware is built with these: the default link's with each profile
             profile: resolve({"modulation": {"id": profile}}).codebook.digest
             for profile in definition["enums"]["profile"]
             if profile not in ("doc", "custom")
@@ -147,8 +147,8 @@ def render(template: str, definition: Table) -> str:
     )
 
 
-def _columns(rows: Sequence[tuple[str, ...]]) -> str:
-    """A fenced block of left-aligned columns."""
+def _align_columns(rows: Sequence[tuple[str, ...]]) -> str:
+    """Rows as a fenced block of left-aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ("  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows)
     return "\n".join(["```text", *lines, "```"])
@@ -157,8 +157,8 @@ def _columns(rows: Sequence[tuple[str, ...]]) -> str:
 _MARK = "<!-- What follows is generated from protocol.toml by firmware_host.protocol.generate. -->\n"
 
 
-def generated_files() -> dict[Path, str]:
-    """Every generated file and what it should hold."""
+def render_files() -> dict[Path, str]:
+    """Content of every generated file by its path."""
     definition = tomllib.loads((HERE / "protocol" / "protocol.toml").read_text())
     headers, modules = HERE / "firmware" / "generated", HERE / "protocol" / "generated"
     places = {"requests.py": modules, "profiles.py": modules, "protocol.h": headers, "profiles.h": headers}
@@ -176,12 +176,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m firmware_host.protocol.generate", description=__doc__)
     parser.add_argument("--check", action="store_true", help="only say which files are stale")
     check = parser.parse_args(arguments).check
-    stale = [p for p, text in generated_files().items() if not p.exists() or p.read_text() != text]
+    stale = [p for p, text in render_files().items() if not p.exists() or p.read_text() != text]
     for path in stale:
         if check:
             sys.stderr.write(f"{path.name} is stale: run python -m firmware_host.protocol.generate\n")
         else:
-            path.write_text(generated_files()[path])
+            path.write_text(render_files()[path])
             sys.stdout.write(f"wrote {path.name}\n")
     return int(check and bool(stale))
 

@@ -1,4 +1,4 @@
-"""LED rows, as a bank of chip masks and an LED record hold them: 12 bytes per chip, LED 0 the first bit."""
+"""LED rows of chip masks and LED records: 12 bytes a chip, LED 0 in the first bit."""
 
 from typing import Any
 
@@ -13,10 +13,10 @@ BOARD_LEDS: NDArray[np.int64] = np.repeat(np.arange(CLUSTERS), LEDS // CLUSTERS)
 BOARD_LEDS.setflags(write=False)
 
 
-def rows_of_leds(leds: NDArray[Any]) -> NDArray[np.uint8]:
-    """Rows, uint8 (n, 12), of LEDs that are 0 or 1, (n, LEDs): 96 at most.
+def pack_led_rows(leds: NDArray[Any]) -> NDArray[np.uint8]:
+    """Rows, uint8 (n, 12), of at most 96 LEDs that are 0 or 1, (n, LEDs).
 
-    >>> rows_of_leds(np.array([[0, 1, 1]])).tolist()
+    >>> pack_led_rows(np.array([[0, 1, 1]])).tolist()
     [[96, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]]
     """
     rows = np.packbits(leds.astype(np.uint8), axis=1)

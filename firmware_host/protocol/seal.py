@@ -6,8 +6,8 @@ A seal is the first `SEAL_BYTES` of
 HMAC( key, challenge | type u8 | SEALED u8 | session u16 | number u32 | payload )
 ```
 
-`number` goes on where the sequence in the header wraps, so that no request of a session comes twice; the
-challenge is another one in each session, so that none of an earlier session is taken again.
+`number` does not wrap with the sequence in the header, so that no request of a session is repeated; each
+session has another challenge, so that no request of an earlier one is accepted.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ _HEAD = struct.Struct("<BBHI")
 
 
 def key_name(key: bytes) -> bytes:
-    """What a key is called: the first bytes of its SHA-256."""
+    """A key's name: the first bytes of its SHA-256."""
     return hashlib.sha256(key).digest()[:KEY_NAME_BYTES]
 
 
@@ -31,7 +31,7 @@ class Sealer:
 
     Attributes:
         key: The board's key.
-        challenge: What the board drew for the session.
+        challenge: The board's random bytes for the session.
         start: Number of the request with token 0.
     """
 
@@ -40,6 +40,6 @@ class Sealer:
     start: int
 
     def seal(self, type_: int, session: int, token: int, payload: bytes) -> bytes:
-        """The seal that goes behind the payload of the request with a token."""
+        """The seal that follows the payload of the request with a token."""
         head = _HEAD.pack(type_, SEALED, session, (self.start + token) & 0xFFFFFFFF)
         return hmac.digest(self.key, self.challenge + head + payload, "sha256")[:SEAL_BYTES]

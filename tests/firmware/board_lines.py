@@ -12,7 +12,7 @@ from firmware_host.board.bank import bank_of, random_symbols, symbol_chips
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.emulators.listening import HostLine
-from firmware_host.emulators.native import NativeBoard, serve
+from firmware_host.emulators.native import NativeBoard, serve_board
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.protocol.client import Timing
 
@@ -71,7 +71,7 @@ def state_of(board):
 
 def shown_chips(device):
     """What each LED did since the last look, uint8 (chips, 96)."""
-    return device.records().played().chips(None)
+    return device.take_led_record().select_chips().chips(None)
 
 
 def packets_shown(chips, link=LINK):
@@ -107,7 +107,7 @@ class Native:
     def __init__(self, listen, **options):
         self.board, self.line = NativeBoard(**options), HostLine(listen)
         self.ended = threading.Event()
-        self.thread = threading.Thread(target=serve, args=(self.board, self.line, self.ended.is_set))
+        self.thread = threading.Thread(target=serve_board, args=(self.board, self.line, self.ended.is_set))
         self.thread.start()
 
     def end(self):

@@ -75,7 +75,7 @@ def check_plays(device, board, bank, leds):
     done = provision(board, bank, Settings(duty_limit=share / 1000))
     assert (done.written, done.swapped) == (len(bank.content), True)
     device.run(400_000)
-    record = device.records().played()
+    record = device.take_led_record().select_chips()
     check_round(record.chips(None), leds, len(leds) + 1)
     assert (record.numbers == np.arange(len(record))).all()
     assert (np.diff(record.ticks) == device.TICK_HZ // bank.chip_rate_hz).all()
@@ -205,7 +205,7 @@ def test_what_the_firmware_refuses(device, board):
         board.session.call(protocol.StreamRequest(0, Format.CLUSTERS, commit.digest))
     board.prepare(bank)
     device.run(10_000)
-    assert not device.shown().any()
+    assert not device.lit_leds().any()
 
 
 def test_what_hello_says_decides(board):
@@ -265,7 +265,7 @@ def test_the_commands(evlcp, tmp_path, device, board):
     provision(board, bank_of(symbols, link), Settings())
     device.run(200_000)
     record, out = tmp_path / "leds.bin", tmp_path / "chips.npy"
-    record.write_bytes(device.records().to_bytes())
+    record.write_bytes(device.take_led_record().to_bytes())
     well(evlcp("board", "leds", record, "--chips", out, *OPTIONS))
     chips, whole = np.load(out), symbol_chips(symbols, link.codebook)
     assert (chips == np.resize(whole, chips.shape)).all()
@@ -329,14 +329,14 @@ def test_a_stream_rests_while_nothing_is_sent(serial, device, board):
         assert [stream.send(symbols) for _ in range(3)] == [1, 2, 3]
         assert stream.pauses > 5
     assert (stream.underruns, stream.sent) == (0, 4)
-    chips = device.records().played().chips(link.bar.led_clusters())
+    chips = device.take_led_record().select_chips().chips(link.bar.led_clusters())
     packets = chips.reshape(-1, len(packet_chips))
     sent = (packets == packet_chips).all(1)
     assert (packets[~sent] == 1).all(), "the level of a pause"
     assert sent.sum() == 4
     assert np.flatnonzero(sent)[0] >= 3, "it rests from the first chip on"
     assert sent[-3:].all(), "behind one another"
-    assert not device.shown().any()
+    assert not device.lit_leds().any()
 
 
 def test_what_would_be_characters_is_refused(serial, board):

@@ -188,7 +188,7 @@ def test_a_part_without_brown_out_is_reported(evlcp, tmp_path):
         rom = RomEmulator()
         before = bytes(rom.options)
         with socket.create_server(("127.0.0.1", 0)) as server:
-            thread = threading.Thread(target=serve, args=(rom, server))
+            thread = threading.Thread(target=serve_board, args=(rom, server))
             thread.start()
             port = f"tcp:127.0.0.1:{server.getsockname()[1]}"
             done = evlcp("board", "flash", tmp_path / "image.bin", "--port", port, *options)
@@ -201,7 +201,7 @@ def test_a_part_without_brown_out_is_reported(evlcp, tmp_path):
         assert rom.options[1:] == before[1:]
 
 
-def serve(rom, server):
+def serve_board(rom, server):
     """A ROM at a port, for one host."""
     with server.accept()[0] as line:
         while data := line.recv(4096):

@@ -146,14 +146,14 @@ def test_no_stretch_of_what_is_sent_is_beyond_the_limits(stream, stops):
     board.program(bank)
     assert board.status().duty == np.ceil(1000 * mean - 1e-9)
 
-    device.records()
+    device.take_led_record()
     sent, ended = [np.zeros((0, 96), np.uint8)], 0
     for n, chips in enumerate([*stops, 3000]):
         board.start()
         device.run(100 * chips)
         faults = board.status().faults
         board.blank()
-        record = device.records().played()
+        record = device.take_led_record().select_chips()
         part = record.chips(None)
         # the first row beyond the limits is the one that was not shown
         endless = np.resize(rows, (len(part) + 1, 96))

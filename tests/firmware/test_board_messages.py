@@ -56,7 +56,7 @@ def messages_of(symbols, link=LINK):
 
 def packets_on(leds):
     """Symbols of the packets that a board showed; what is between them is left out."""
-    return symbols_of(np.concatenate(packets_shown(LedRecord.read(leds).played().chips())[0]))
+    return symbols_of(np.concatenate(packets_shown(LedRecord.read(leds).select_chips().chips())[0]))
 
 
 def test_a_text_a_file_and_a_beacon(evlcp, site, tmp_path):

@@ -16,7 +16,7 @@ from evlcp_sdk.errors import ConfigError
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.ports.serial_port import SerialTransport
 from firmware_host.ports.transport import open_transport
-from firmware_host.ports.usb import UsbFilter, device_of, serial_ports
+from firmware_host.ports.usb import UsbFilter, find_usb_device, serial_ports
 
 serial = pytest.importorskip("serial")
 Fault = serial.SerialException
@@ -73,12 +73,12 @@ def opened(monkeypatch):
 )
 def test_ports_by_usb_id(ports, text, takes):
     wanted = UsbFilter.parse(text)
-    assert [p.device for p in serial_ports() if wanted.takes(p)] == takes
+    assert [p.device for p in serial_ports() if wanted.matches(p)] == takes
     if takes:
-        assert device_of(text) == takes[0]
+        assert find_usb_device(text) == takes[0]
     else:
         with pytest.raises(NoBoardError, match="no serial port has this USB id"):
-            device_of(text)
+            find_usb_device(text)
 
 
 def test_a_usb_id_must_be_one(ports, opened):

@@ -32,9 +32,9 @@ def definition():
 
 def test_generated_files_are_fresh(monkeypatch, capsys):
     assert generate.main(["--check"]) == 0, "run python -m firmware_host.protocol.generate"
-    files = generate.generated_files()
+    files = generate.render_files()
     first = next(iter(files))
-    monkeypatch.setattr(generate, "generated_files", lambda: files | {first: "other"})
+    monkeypatch.setattr(generate, "render_files", lambda: files | {first: "other"})
     assert generate.main(["--check"]) == 1
     assert first.name in capsys.readouterr().err
 
@@ -92,10 +92,10 @@ def test_message_round_trip(message):
 def test_message_of_another_length_is_refused(message, cut):
     data = message.pack()
     cls = type(message)
-    if len(data) >= cut and data[:-cut] and len(data) - cut < cls.fixed_bytes():
+    if len(data) >= cut and data[:-cut] and len(data) - cut < cls.min_bytes():
         with pytest.raises(DatagramError):
             cls.unpack(data[:-cut])
-    if not cls.takes_more():
+    if not cls.is_open_ended():
         # of a later minor version
         assert cls.unpack(data + b"x" * cut) == message
 
@@ -141,7 +141,7 @@ def test_endless_line_does_not_fill_memory():
     decoder = DatagramDecoder()
     for _ in range(100):
         assert decoder.feed(b"\x55" * 1000) == []
-    assert len(decoder._open) <= MAX_WIRE_BYTES + 1000
+    assert len(decoder._partial) <= MAX_WIRE_BYTES + 1000
     good = Datagram(12, 0, 1, 2, b"")
     assert decoder.feed(b"\0" + good.encode()) == [good]
 
@@ -160,7 +160,7 @@ def test_window_bounds_what_is_under_way():
     tokens = [client.submit(messages.CrcRequest(0, i, 1)) for i in range(5)]
     first = sent_bytes(client)
     assert len(first) == 3
-    assert not client.room
+    assert not client.has_room
     done = client.receive(reply(first[1], messages.CrcReply(9).pack()))
     assert [(o.token, o.reply) for o in done] == [(tokens[1], messages.CrcReply(9))]
     assert len(sent_bytes(client)) == 1

@@ -34,7 +34,7 @@ class Wire:
     def send(self, type_, payload, sequence, session):
         self.device.receive(Datagram(type_, 0, sequence, session, payload).encode())
         self.device.run(0)
-        (self.reply,) = DatagramDecoder().feed(self.device.sent())
+        (self.reply,) = DatagramDecoder().feed(self.device.take_output())
         assert (self.reply.type, self.reply.sequence) == (type_ | protocol.REPLY_BIT, sequence)
         self.detail = int.from_bytes(self.reply.payload[:4], "little")
         return self.reply.status
@@ -128,7 +128,7 @@ def test_a_control_request_is_done_once_and_none_that_is_older(wire):
 
 
 def test_dark_until_commit_and_start(wire):
-    wire.device.records()
+    wire.device.take_led_record()
     assert wire.ask(START) == Status.NOTHING_COMMITTED
     wire.fill(0, BANK.content)
     assert wire.ask(replace(commit_of(BANK), crc=BANK.crc ^ 1)) == Status.BAD_CRC
@@ -138,10 +138,10 @@ def test_dark_until_commit_and_start(wire):
     assert wire.each(START, commit_of(BANK), commit_of(BANK)) == again
     wire.chips(100)
     assert wire.status().commits == 1
-    assert not len(wire.device.records())
+    assert not len(wire.device.take_led_record())
     assert wire.ask(START) == Status.OK
     wire.chips(100)
-    played = wire.device.records()
+    played = wire.device.take_led_record()
     assert played.numbers.tolist() == list(range(100))
     assert (played.chips() == BANK.chips[:100]).all()
 
@@ -150,19 +150,19 @@ def test_stop_ends_with_the_packet_and_blank_at_once(wire):
     wire.committed()
     wire.ask(START)
     wire.chips(40)
-    wire.device.records()
+    wire.device.take_led_record()
     assert wire.ask(STOP) == Status.OK
     assert wire.status().state == State.STOPPING
     wire.chips(1000)
-    rest = wire.device.records().numbers
+    rest = wire.device.take_led_record().numbers
     assert (len(rest), rest[-1]) == (PACKET - 40 + 1, protocol.CHIP_DARK)
     assert (wire.status().state, wire.status().packets_sent) == (State.DARK, 1)
     wire.ask(START)
     wire.chips(100)
-    wire.device.records()
+    wire.device.take_led_record()
     assert wire.ask(BLANK) == Status.OK
     wire.chips(1000)
-    assert wire.device.records().numbers.tolist() == [protocol.CHIP_DARK]
+    assert wire.device.take_led_record().numbers.tolist() == [protocol.CHIP_DARK]
     # a START that comes while it stops plays on
     wire.ask(START)
     wire.chips(10)
@@ -215,10 +215,10 @@ def test_a_foreign_codebook_never_plays(wire):
     for changed in (replace(mine, pilots=others.pilots), replace(mine, preamble=1)):
         assert wire.each(changed, commit) == [Status.OK, Status.BUSY]
     assert wire.each(mine, commit) == [Status.OK] * 2
-    wire.device.records()
+    wire.device.take_led_record()
     wire.ask(START)
     wire.chips(2)
-    assert wire.device.records().chips()[:, 0].tolist() == [1, 0]
+    assert wire.device.take_led_record().chips()[:, 0].tolist() == [1, 0]
 
 
 def test_limits_of_configure(wire):
@@ -254,7 +254,7 @@ def test_a_chip_that_comes_a_whole_chip_late_ends_in_the_dark(wire):
     wire.device.bench.late = 1000
     wire.chips(2)
     assert wire.status().state == State.FAULT
-    assert not wire.device.shown().any()
+    assert not wire.device.lit_leds().any()
 
 
 def test_the_idle_pattern_begins_with_a_packet_and_ends_with_one(wire):
@@ -263,12 +263,12 @@ def test_the_idle_pattern_begins_with_a_packet_and_ends_with_one(wire):
     assert found == [Status.OUT_OF_RANGE, Status.OUT_OF_RANGE, Status.OK]
     wire.committed()
     wire.ask(START)
-    wire.device.records()
+    wire.device.take_led_record()
     wire.chips(900)
     wire.status()
     wire.chips(3000)
     # silent since chip 900 it acts after chip 1900, at the end of the packet
-    chips = wire.device.records().chips()
+    chips = wire.device.take_led_record().chips()
     assert (chips[:2076] == np.resize(BANK.chips, (2076, 16))).all()
     assert (chips[2077:] != chips[2076:-1]).all()
     found = wire.status()
@@ -285,12 +285,12 @@ def test_slots_of_save(wire):
     tests = [protocol.LedTestRequest(*test) for test in ((0, 96, 1), (0, 0, 0), (0, 95, 1000))]
     assert wire.each(*tests) == [Status.OUT_OF_RANGE, Status.OUT_OF_RANGE, Status.OK]
     assert wire.each(SAVE, RECALL, STOP) == [Status.BUSY, Status.BUSY, Status.OK]
-    assert not wire.device.shown().any()
+    assert not wire.device.lit_leds().any()
     # a whole slot of the layout before pilot_every is empty to this firmware
-    header = bytearray(wire.device.flash()[:124])
+    header = bytearray(wire.device.read_flash()[:124])
     header[:4] = (0x45564C31).to_bytes(4, "little")
-    old = bytes(header) + zlib.crc32(header).to_bytes(4, "little") + wire.device.flash()[128:]
-    wire.device.set_flash(old)
+    old = bytes(header) + zlib.crc32(header).to_bytes(4, "little") + wire.device.read_flash()[128:]
+    wire.device.replace_flash(old)
     wire.hello(2)
     assert wire.ask(RECALL) == Status.EMPTY_SLOT
     assert wire.status().active_bank == NO_BANK

@@ -25,7 +25,7 @@ def crystal(ppm=0.0):
 
 def times_us(device, ppm):
     """True times of the chips played."""
-    return device.records().played().ticks / 10 / (1 + ppm * 1e-6)
+    return device.take_led_record().select_chips().ticks / 10 / (1 + ppm * 1e-6)
 
 
 def test_boards_60_ppm_apart_stay_within_a_hundredth_of_a_chip_until_pulses_cease():
@@ -35,7 +35,7 @@ def test_boards_60_ppm_apart_stay_within_a_hundredth_of_a_chip_until_pulses_ceas
         device.run(1_700_000)
         assert start_together([board]) == [5]
         assert board.status().state == State.WAITING
-        device.records()
+        device.take_led_record()
         device.run(24_000_000)
         assert state_of(board) == (State.PLAYING, 0)
         found.append(times_us(device, ppm)[:200_000])
@@ -61,15 +61,15 @@ def test_start_at_a_clock():
     clock = board.status().clock
     board.start(at_clock=clock + 300_000)
     assert board.status().state == State.WAITING
-    device.records()
+    device.take_led_record()
     device.run(100_000)
-    assert device.records().played().ticks[0] == clock + 300_000 + 1_000
+    assert device.take_led_record().select_chips().ticks[0] == clock + 300_000 + 1_000
     board.blank()
     # STOP before the moment: it does not come
     board.start(at_clock=board.status().clock + 300_000)
     board.stop()
     device.run(100_000)
-    assert not len(device.records().played())
+    assert not len(device.take_led_record().select_chips())
     assert board.status().state == State.DARK
 
 

@@ -30,7 +30,7 @@ LONG = board_link("air.frames_per_packet=40", "air.pilot_every=4")
 
 
 def played_packets(device, link=LINK):
-    found, idle = packets_shown(device.records().played().chips(), link)
+    found, idle = packets_shown(device.take_led_record().select_chips().chips(), link)
     return [packet.tobytes() for packet in found], idle
 
 
@@ -46,7 +46,7 @@ def test_packets_follow_without_a_gap(device, link, latency_s, ahead):
         for n, packet in enumerate(packets):
             assert stream.send(packet) == n
             assert stream.sent - stream.begun <= ahead + 1
-    chips = device.records().played()
+    chips = device.take_led_record().select_chips()
     assert (np.diff(chips.ticks) == 1000).all()
     length = link.packet.packet_chips
     at = len(chips) - 30 * length
@@ -55,9 +55,9 @@ def test_packets_follow_without_a_gap(device, link, latency_s, ahead):
     assert (chips.chips()[:at] == np.arange(at)[:, None] % 2).all()
     assert at % 2 == 0
     assert (stream.underruns, stream.sent) == (0, 30)
-    pieces = -(-link.packet.frames * 32 // (512 - protocol.PushRequest.fixed_bytes()))
+    pieces = -(-link.packet.frames * 32 // (512 - protocol.PushRequest.min_bytes()))
     assert stream.requests <= 30 * pieces + 3
-    assert not device.shown().any()
+    assert not device.lit_leds().any()
 
 
 def test_an_empty_queue_is_named_and_shows_the_idle_pattern(device):
@@ -113,7 +113,7 @@ def test_the_watchdog_acts_on_a_stream_whose_host_is_gone(device, board):
     stream.wait(1.0)
     assert status_of(stream).state == State.IDLE_PATTERN
     device.run(500_000)
-    assert not device.shown().any()
+    assert not device.lit_leds().any()
 
 
 def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_reported(device, board):
@@ -121,7 +121,7 @@ def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_reported(device, board):
         for packet in symbols_of(4):
             stream.send(packet)
         raise KeyError("x")
-    assert not device.shown().any()
+    assert not device.lit_leds().any()
     assert board.status().packets_sent < 4
     stream = board.stream(LINK)
     device.reset()
@@ -248,7 +248,7 @@ def test_what_changes_is_right_at_its_first_chip(device, latency_s):
 
         assert stream.play(next_one, 0.25) == 8
     assert stream.underruns == 0
-    record = device.records().played()
+    record = device.take_led_record().select_chips()
     chips, length = record.chips(), LINK.packet.packet_chips
     starts = starts_of(chips, record.ticks, stream.sent, length)
     packets = [chips[n : n + length].tobytes() for n in np.searchsorted(record.ticks, starts)]

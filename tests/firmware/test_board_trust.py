@@ -77,7 +77,7 @@ def test_a_locked_board_does_all_with_its_key_and_nothing_without(device):
 def test_seals_are_hmac_sha256_of_any_length(count, key):
     """The firmware's HMAC against hashlib's, over every length of a block."""
     board = lock(SimulatedBoard(), key)
-    count = min(count, board.session.max_payload - protocol.WriteRequest.fixed_bytes())
+    count = min(count, board.session.max_payload - protocol.WriteRequest.min_bytes())
     data = bytes(n % 251 for n in range(count))
     written = board.session.call(protocol.WriteRequest(1, 7, data))
     assert written == protocol.WriteReply(1, 7, count)
@@ -89,7 +89,7 @@ def test_any_bit_that_is_changed_is_found(device):
     line, client = SimulatedLine(device), board.session.client
     client.submit(protocol.LevelRequest(33))
     wire = client.poll(0.0)[0]
-    client.forget()
+    client.drop_requests()
     good = Datagram.decode(wire[:-1])
     body = bytes([good.type, good.status]) + good.sequence.to_bytes(2, "little") + good.payload
     answers = set()
@@ -143,7 +143,7 @@ def test_what_was_recorded_works_again_on_a_board_without_a_key_and_not_on_one_w
     for _ in range(2):
         before = held_state(device)
         assert Status.BAD_SEAL in replay_datagrams(SimulatedLine(device), wire)
-        assert not device.shown().any()
+        assert not device.lit_leds().any()
         assert held_state(device) == before
         device.reset()
 
@@ -176,7 +176,7 @@ def test_who_has_no_key_does_not_stand_in_for_the_host(device):
     for _ in range(20):
         stranger.status()
         device.run(50_000)
-    assert not device.shown().any(), "the watchdog acts though a stranger asks"
+    assert not device.lit_leds().any(), "the watchdog acts though a stranger asks"
     assert stranger.status().state == State.DARK
 
 
@@ -212,9 +212,9 @@ def test_a_key_is_kept_and_changed(device):
         board_on(device, key=KEY)
     board_on(device, key=OTHER).save()
     # the newest slot's content is damaged: an older one plays, with the newest key all the same
-    flash = bytearray(device.flash())
+    flash = bytearray(device.read_flash())
     flash[len(flash) // 2 + 200] ^= 0x10
-    device.set_flash(bytes(flash))
+    device.replace_flash(bytes(flash))
     board = board_on(device, key=OTHER)
     assert board.recall().slot == 0
     board.level(33)

@@ -109,17 +109,17 @@ def test_wrong_masks_are_reported(tmp_path):
 def test_flicker_of_known_waves():
     # a 100 Hz square wave of full modulation: its fundamental is 4/pi of the mean
     wave = np.tile(np.repeat([[1], [0]], 50, axis=0), (10, 1)).astype(np.uint8)
-    row = flicker.check(wave, 10_000.0)[0]
+    row = flicker.measure_flicker(wave, 10_000.0)[0]
     assert row.line_hz == 100.0
     assert row.line_percent == pytest.approx(100 * 4 / np.pi, rel=1e-3)
     assert (row.on_share, row.longest_run, row.low_risk) == (0.5, 50, False)
     # 5 kHz alternation has no line below 3 kHz
     fast = np.tile([[0], [1]], (500, 1)).astype(np.uint8)
-    row = flicker.check(fast, 10_000.0)[0]
+    row = flicker.measure_flicker(fast, 10_000.0)[0]
     assert (row.line_percent, row.longest_run, row.no_effect) == (0.0, 1, True)
     # constant light does not flicker, darkness neither
     for level in (0, 1):
-        assert flicker.check(np.full((100, 1), level, np.uint8), 10_000.0)[0].no_effect
+        assert flicker.measure_flicker(np.full((100, 1), level, np.uint8), 10_000.0)[0].no_effect
 
 
 def test_a_flickering_payload_ends_with_one(evlcp):

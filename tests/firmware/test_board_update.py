@@ -164,8 +164,8 @@ def test_what_is_interrupted_keeps_the_old_one_and_ends_well_later(device):
 class SlowLine(UsbLine):
     """A line and a board that take two hundred times as long as they should."""
 
-    def now(self):
-        return 200 * super().now()
+    def time_s(self):
+        return 200 * super().time_s()
 
     def read(self, timeout_s):
         return super().read(timeout_s / 200)

@@ -112,7 +112,7 @@ def test_the_host_of_2_0_and_this_firmware():
         device.receive(data)
         for _ in range(40):
             device.run(1_000)
-            wire += device.sent()
+            wire += device.take_output()
     theirs, ours = (DatagramDecoder().feed(whole) for whole in (expected, wire))
     assert len(theirs) == len(ours) > 30
     for old, new in zip(theirs, ours, strict=True):

@@ -50,7 +50,7 @@ def test_hitless_swaps(device, board):
     for n, symbols in enumerate(payloads.values()):
         provision(board, bank_of(symbols, LINK), Settings())
         device.run(int(np.random.default_rng(n).integers(200_000, 500_000)))
-    played = device.records().played()
+    played = device.take_led_record().select_chips()
     assert (np.diff(played.ticks) == 1000).all(), "a chip was lost or late"
     assert (played.numbers == np.arange(len(played))).all()
     sequence = packet_sequence(played, payloads)
@@ -65,7 +65,7 @@ def test_programming_over_a_very_noisy_line(device):
     assert provision(board, payload, Settings()).retries > 20
     device.run(3_000_000)
     assert board.crc(0, 0, len(payload.content)) == payload.crc
-    sequence = packet_sequence(device.records().played(), {"new": symbols})
+    sequence = packet_sequence(device.take_led_record().select_chips(), {"new": symbols})
     assert check_order(sequence, {"new": 64}) == ["new"]
     assert len(sequence) > 64
 
@@ -99,7 +99,7 @@ def test_host_killed_at_any_moment():
         with pytest.raises(KeyboardInterrupt):
             provision(board_on(FatalLine(device, int(moment), dies), nonce=7), bank, Settings())
         device.run(400_000)
-        sequence = packet_sequence(device.records().played(), {"old": OLD, "new": new})
+        sequence = packet_sequence(device.take_led_record().select_chips(), {"old": OLD, "new": new})
         order = check_order(sequence, {"old": 2, "new": 24})
         assert order in (["old"], ["old", "new"])
         ends[order[-1]] += 1
@@ -141,17 +141,17 @@ def test_save_survives_reset_and_damage(device, board):
     assert board.holds(second, status)
     assert not board.program(second).written
     assert (status.level_ma, status.watchdog, status.watchdog_ms) == (33, Watchdog.IDLE, 700)
-    held = bytearray(device.flash())
+    held = bytearray(device.read_flash())
     held[len(held) // 2 + 200] ^= 0x10
-    device.set_flash(bytes(held))
+    device.replace_flash(bytes(held))
     board = board_on(device)
     assert board.recall().slot == 0
     assert board.holds(first, board.status())
     board.save(autostart=True)
     device.reset()
-    device.records()
+    device.take_led_record()
     device.run(100_000)
-    assert (device.records().played().chips()[:346] == first.chips).all()
+    assert (device.take_led_record().select_chips().chips()[:346] == first.chips).all()
     device.bench.flash_fails = True
     board = board_on(device)
     board.blank()
@@ -171,7 +171,7 @@ def test_faults_show_and_darken_and_end_the_led_test(device, board):
         health.faults = BoardFault.OVER_TEMPERATURE
         device.run(300_000)
         assert board.status().state == State.FAULT
-        assert not device.shown().any()
+        assert not device.lit_leds().any()
         with pytest.raises(RefusedError, match="a fault holds the LEDs dark"):
             board.start()
         health.faults = 0
@@ -179,7 +179,7 @@ def test_faults_show_and_darken_and_end_the_led_test(device, board):
         assert tested or state_of(board) == (State.FAULT, BoardFault.OVER_TEMPERATURE), "until START"
         if not tested:
             board.test_leds(0, 95, 1000)
-            assert device.shown().any()
+            assert device.lit_leds().any()
     board.start()
     device.run(10_000)
     assert state_of(board) == (State.PLAYING, 0)

@@ -136,7 +136,7 @@ class RomLine:
         self._now = 0.0
         self._out = b""
 
-    def now(self):
+    def time_s(self):
         """Time of the line, s."""
         return self._now
 

@@ -816,7 +816,7 @@ class ModelLine:
         self.name = "model:"
         self.chip = chip
 
-    def now(self):
+    def time_s(self):
         return self.chip.now / UNIT_HZ
 
     def read(self, timeout_s):

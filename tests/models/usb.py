@@ -36,7 +36,7 @@ class UsbLine(SimulatedLine):
         while True:
             while self._out and self._out[0][0] <= self.board.now_us:
                 self.board.receive(self._out.popleft()[1])
-            sent = self.board.sent()
+            sent = self.board.take_output()
             if sent:
                 self._in_free_us = max(self.board.now_us, self._in_free_us) + len(sent) * self._byte_us
                 self._in.append((self._in_free_us + self._latency_us, sent))
