@@ -1,4 +1,4 @@
-"""Counting events in time, and the sliding correlation, compiled."""
+"""Counts events in time, and correlates them with a preamble: compiled."""
 
 from typing import Any
 
@@ -11,14 +11,14 @@ Array = NDArray[Any]
 
 
 _STRIDE = 16
-"""Events that are passed over at once in search of a bin's end: a bar has dozens in a bin of 10 us."""
+"""Events that are skipped at once in search of a bin's end: a bar has dozens in a bin of 10 us."""
 
 
 @njit
 def count_bins(t_us: Array, p: Array, where: tuple[int, float, int], known: Array, counts: Array) -> None:
     """Add events to `known` counts, by polarity (row) and time (column).
 
-    Of `where` are the number of the first column, the length of each, us, and how many of those known are
+    `where` holds the number of the first column, the length of each, us, and how many of the known ones are
     before it.
     """
     first_bin, bin_us, skipped = where
@@ -58,9 +58,9 @@ def correlate(counts: Array, chips: Array, due: Array, steps: int, min_events: i
     """Normalised correlation of signed counts in windows of one chip (`steps` bins) with chips (-1, +1).
 
     The lesser of two norms: by the number of events, which is small unless all clusters blink in phase, and
-    by the length of the vector of chips (a cosine), which is small where few chips hold all events, as in
-    a flash. In chips that are not `due` (0, else 1), without an edge, late events agree with the chip and say
-    nothing; others count against it. Lags at which fewer than `min_events` were counted get 0.
+    by the length of the vector of chips (a cosine), which is small where few chips hold all events, as in a
+    flash. In chips that are not `due` (0, else 1), without an edge, late events agree with the chip and do
+    not count; others count against it. Lags with fewer than `min_events` get 0.
     """
     many, lags = 0.0, rho.size
     bins = lags - 1 + steps * chips.size
@@ -99,13 +99,13 @@ def find_peaks(
     enough: tuple[float, float],
     peaks: Array,
 ) -> tuple[float, int, int]:
-    """Lags from one on that correlate enough, and best within `guard` on both sides, the first of equals.
+    """Find lags from one on that correlate enough, and best within `guard` to both sides, first of equals.
 
     Enough is the second of `enough` in any case, and from half of it the first times the root of the mean
     square of the positive correlations up to each. The newest weigh most: `past` are mean square and number
-    before the lag, and the most that count. Infinite as long as less than half as many are known. Where light
-    ends, windows of `span` bins hold fewer events than those that the mean squares are of: they are no less
-    than that of as many events of random sign.
+    before the lag, and the most that count. The threshold is infinite as long as less than half as many are
+    known. Where light ends, windows of `span` bins hold fewer events than those of the mean square, which is
+    no less than that of as many events of random sign.
 
     Returns:
         Mean square and number at the end, and how many `peaks` (n,) there are among so many lags.

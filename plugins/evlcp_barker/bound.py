@@ -1,4 +1,4 @@
-"""From which correlation on events are a preamble: by what its codebook's codes make of a pixel's answers."""
+"""The correlation from which on events are a preamble, by what a codebook's codes make pixels answer."""
 
 from functools import lru_cache
 
@@ -9,29 +9,30 @@ from evlcp_barker import _kernels
 from evlcp_sdk.air.codebook import Codebook, edges_of_chips, is_pair_code
 from evlcp_sdk.air.frames import packet_chips
 
-_HALF = 0.5
-"""Of the events of a preamble half agree with it and are its own, at the least: what is missing, other light
-in the region, its halo and its repeated events take up to the other half."""
+_GOOD_SHARE = 0.5
+"""Least share of a preamble's events that agree with it and are its own: what is missing, other light in the
+region, its halo and its repeated events take up to the other half."""
 
-_POOR = 0.7
-"""What a preamble has that is seen poorly: of pair codes .8 and more, as a rule."""
+_POOR_SHARE = 0.7
+"""The share of a preamble that is seen poorly: of pair codes .8 and more, as a rule."""
 
 _PACKETS = 256
-"""Packets of random symbols that the reach of the other codes is taken from, over the number of clusters: the
+"""Packets of random symbols that the reach of other codes is taken from, over the number of clusters: the
 fewer these are, the further it is from what is likely to what is possible."""
 
-_RARELY = 3e-4
+_RARE_SHARE = 3e-4
 """Share of all chips at which other codes may reach it: in one of ten packets; a preamble that fits better
 takes over at once."""
 
-_APART_CHIPS = 3
-"""Nearer to a preamble it is the preamble itself: pair codes have high sidelobes one and two chips away."""
+_SIDELOBE_CHIPS = 3
+"""Distance up to which a peak is the preamble's own: pair codes have high sidelobes one and two chips
+away."""
 
 
 def due_chips(preamble: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Chips of a preamble in which events are due, bool (P,): all of a pair code, else those behind an edge.
 
-    The first may have one before it, whatever was sent there.
+    The first may have an edge before it, whatever was sent there.
     """
     due = np.ones(len(preamble), np.bool_)
     if not is_pair_code(preamble):
@@ -40,14 +41,14 @@ def due_chips(preamble: NDArray[np.uint8]) -> NDArray[np.bool_]:
 
 
 def preamble_share(preamble: NDArray[np.uint8]) -> float:
-    """Share of a preamble's events that tell, where pixels are slow: the most that it correlates to there.
+    """Share of a preamble's events that carry information on slow pixels: its highest correlation there.
 
     A pixel answers an edge for as long as its light stays: with a logarithmic receptor (charge Q, irradiance
     I) the signal falls as ln(1 + t I / Q), so that where Q / I is a chip ln(1 + 1 / (k + 1)) events come in
     the k-th chip behind the edge. On slower pixels an edge ends before it reaches the threshold (at 10 000
-    chips/s: below .15 W/m2, as in a bright lamp's halo). All that come in a chip without an edge say nothing
-    (`_kernels.correlate`), but count as seen. In a pair code, whose light never stays longer than two chips,
-    they agree with the chip: its share is 1.
+    chips/s: below .15 W/m2, as in a bright lamp's halo). All that come in a chip without an edge carry no
+    information (`_kernels.correlate`), but count as seen. In a pair code, whose light never stays longer than
+    two chips, they agree with the chip: its share is 1.
 
     >>> from evlcp_sdk.air.codebook import BARKER13, chips_of_values
     >>> pairs = chips_of_values(BARKER13)
@@ -55,7 +56,7 @@ def preamble_share(preamble: NDArray[np.uint8]) -> float:
     [1.0, 0.55, 0.45]
     """
     chips = np.asarray(preamble)[:, None]
-    answers = np.log1p(1 / (_since_edge(chips)[:, 0] + 1))
+    answers = np.log1p(1 / (_chips_since_edge(chips)[:, 0] + 1))
     return float(answers[due_chips(preamble)].sum() / answers.sum())
 
 
@@ -77,7 +78,7 @@ def least_correlation(codebook: Codebook, frames: int, pilot_every: int) -> floa
     [0.7, 0.5]
     """
     share = preamble_share(codebook.preamble)
-    return min(max(_HALF * share, _reach(codebook, frames, pilot_every)), _POOR * share)
+    return min(max(_GOOD_SHARE * share, _code_reach(codebook, frames, pilot_every)), _POOR_SHARE * share)
 
 
 def guard_chips(preamble: NDArray[np.uint8], least: float) -> int:
@@ -93,40 +94,40 @@ def guard_chips(preamble: NDArray[np.uint8], least: float) -> int:
     (3, 30)
     """
     if is_pair_code(preamble):
-        return _APART_CHIPS
+        return _SIDELOBE_CHIPS
     length = len(preamble)
     dark = np.zeros(length, np.uint8)
     counts = np.zeros((2, 3 * length))
-    counts[:, length : 2 * length] = _counts(np.concatenate([dark[:1], preamble])[:, None])[:, 1:]
+    counts[:, length : 2 * length] = _count_events(np.concatenate([dark[:1], preamble])[:, None])[:, 1:]
     rho = np.empty(2 * length + 1)
     _kernels.correlate(counts, 2.0 * preamble - 1, due_chips(preamble), 1, 0, rho)
     away = np.abs(np.flatnonzero(rho >= least) - length)
-    return int(max(away.max(initial=0), _APART_CHIPS))
+    return int(max(away.max(initial=0), _SIDELOBE_CHIPS))
 
 
-def _reach(codebook: Codebook, frames: int, pilot_every: int) -> float:
-    """What pilots and random symbols correlate to with the preamble, but for one chip in `_RARELY`."""
+def _code_reach(codebook: Codebook, frames: int, pilot_every: int) -> float:
+    """Correlation of pilots and random symbols with the preamble, but for a `_RARE_SHARE` of the chips."""
     rng = np.random.default_rng(0)
     packets = max(_PACKETS // codebook.clusters, 8)
     symbols = rng.integers(0, codebook.data_symbols, (packets, frames, codebook.clusters))
     chips = np.concatenate([packet_chips(one, codebook, pilot_every) for one in symbols])
     packet, length = len(chips) // packets, len(codebook.preamble)
-    counts = _counts(chips)
+    counts = _count_events(chips)
     rho = np.empty(len(chips) - length + 1)
     signs = 2.0 * codebook.preamble - 1
     _kernels.correlate(counts, signs, due_chips(codebook.preamble), 1, 0, rho)
     at = np.arange(len(rho)) % packet
-    others = rho[np.minimum(at, packet - at) > _APART_CHIPS]
-    return float(np.quantile(others, 1 - _RARELY)) if len(others) else 0.0
+    others = rho[np.minimum(at, packet - at) > _SIDELOBE_CHIPS]
+    return float(np.quantile(others, 1 - _RARE_SHARE)) if len(others) else 0.0
 
 
-def _counts(chips: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _count_events(chips: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Negative and positive events in each chip of clusters' chips (n, K), float64 (2, n), each at once."""
-    fresh = _since_edge(chips) == 0
+    fresh = _chips_since_edge(chips) == 0
     return np.stack([(fresh & (chips == level)).sum(1) for level in (0, 1)]).astype(np.float64)
 
 
-def _since_edge(chips: NDArray[np.uint8]) -> NDArray[np.int64]:
+def _chips_since_edge(chips: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Chips since the last edge, 0 in the one behind it and in the first, int64 (chips, K)."""
     row = np.arange(len(chips))[:, None]
     edge = np.ones(chips.shape, np.bool_)

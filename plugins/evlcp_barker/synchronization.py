@@ -1,4 +1,4 @@
-"""Packet timing: where preambles are in a sliding correlation, when, and the clock that they show."""
+"""Packet timing: finds preambles by sliding correlation, and filters their times and the clock."""
 
 import math
 from dataclasses import dataclass
@@ -18,35 +18,34 @@ from evlcp_sdk.values import SyncLock, to_kernel_array
 
 Floats = NDArray[np.float64]
 
-_OUTSTANDS = 6.0
+_OUTSTANDING_RMS = 6.0
 """A correlation so many times the rms of a packet's others is a preamble: random data reach 5 in 20 s. The
-rms is no less than one over the root of the events' number, which is that of random signs."""
+rms is no less than one over the root of the events' number, that of random signs."""
 
 _TIMING_SIGMA_US = 2.0
-"""Least spread of one packet's time, from the grid of the correlation and the jitter of the pixels."""
+"""Least error of one packet's time, from the grid of the correlation and the jitter of the pixels."""
 
 _LATENCY_SIGMA_US = 0.5
 """Change of the pixels' latency from packet to packet: it is 3.3 us W/m2 over the light, 20 us at 0.17 W/m2,
 and changes by as much where the light changes by 2.5 %, as when a bar comes nearer."""
 
-_CHANGED_SIGMAS = 3.0
-"""Beyond so many sigmas it is the latency that has changed (a wiper, a shadow), by what is measured: a clock
-cannot."""
+_JUMP_SIGMAS = 3.0
+"""Sigmas beyond which the latency has jumped (a wiper, a shadow), by as much as measured: a clock cannot."""
 
 _WANDER_PPM = 0.1
-"""Change of a quartz's rate in a second, from its warming up."""
+"""Change of a quartz's rate in a second as it warms up."""
 
-_CLEARLY = 0.1
-"""Difference in correlation that separates a preamble from data: from packet to packet it varies by 0.02."""
+_CLEAR_DIFFERENCE = 0.1
+"""Difference in correlation between a preamble and data: from packet to packet it varies by 0.02."""
 
 _QUALITY_PACKETS = 8
 """Packets over which a lock's correlation is averaged."""
 
-_STEPS = 10
+_CHIP_STEPS = 10
 """Correlation steps in a chip: a peak's flat top is a chip long, and its middle is found between steps."""
 
 _MIN_EVENTS = 100
-"""Events of a preamble that counts as detected: of fewer, random signs may agree with its 26 chips."""
+"""Least events of a detected preamble: of fewer, random signs may agree with its 26 chips."""
 
 _ON_GRID_CHIPS = 0.6
 """How far from its expected time a preamble keeps the lock; latency grows by 0.5 behind a wiper."""
@@ -58,13 +57,13 @@ class BarkerSync(Synchronization):
 
     In a preamble all clusters blink in phase; in pilots they cancel, and in info segments they differ. So the
     signed events of a whole region, summed over windows of one chip, correlate with the preamble's chips
-    there and nowhere else. Positive and negative events come with different delays, which are
-    measured apart at every packet, each with its sigma, by the jackknife over the preamble's values: a panel
-    behind the bar adds events to some of them. The clock's rate is all but constant and within a bound;
-    latency wanders with the light, and jumps where the light does. A measurement far from its prediction is
-    a jump of the latency and says nothing of the rate.
+    there and nowhere else. Positive and negative events come with different delays, which are measured apart
+    at every packet, each with its sigma, by the jackknife over the preamble's values: a panel behind the bar
+    adds events to some of them. The clock's rate is all but constant and within a bound; latency wanders with
+    the light, and jumps where the light does. A measurement far from its prediction is a jump of the latency
+    and does not change the rate.
 
-    From which correlation on it is a preamble follows from the codes: see `evlcp_barker.bound`.
+    The correlation from which on it is a preamble follows from the codes: see `evlcp_barker.bound`.
     """
 
     min_correlation: Annotated[
@@ -99,19 +98,19 @@ class _Preamble:
 
 
 @dataclass(frozen=True)
-class _Level:
+class _WanderingLevel:
     """A value that wanders and jumps, and its variance."""
 
     value: float
     variance: float
 
-    def measured(self, value: float, walk: float, noise: float) -> "_Level":
-        """Take a measurement: Kalman's step; variances of the way since the last, and of the measurement."""
-        apart, spread = value - self.value, self.variance + walk + noise
+    def update(self, value: float, drift_variance: float, noise_variance: float) -> "_WanderingLevel":
+        """Update by a measurement (Kalman), by the variances of the change since the last, and of it."""
+        change, spread = value - self.value, self.variance + drift_variance + noise_variance
         # What is too far to have wandered has jumped: that much, then, was the way.
-        spread = max(spread, apart**2) if apart**2 > _CHANGED_SIGMAS**2 * spread else spread
-        gain = 1 - noise / spread
-        return _Level(self.value + gain * apart, gain * noise)
+        spread = max(spread, change**2) if change**2 > _JUMP_SIGMAS**2 * spread else spread
+        gain = 1 - noise_variance / spread
+        return _WanderingLevel(self.value + gain * change, gain * noise_variance)
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ class _Clock:
         on_us: Time of its positive events.
         rate_us: How much longer than nominal a packet is.
         variances: Of the time, of both together, of the rate.
-        apart: How much later negative events come.
+        off_delay: How much later negative events come.
         onset: How much later the first positive events come.
         quality: Mean correlation of the newest.
     """
@@ -134,13 +133,13 @@ class _Clock:
     on_us: float
     rate_us: float
     variances: tuple[float, float, float]
-    apart: _Level
-    onset: _Level
+    off_delay: _WanderingLevel
+    onset: _WanderingLevel
     quality: float
 
 
 class _Peak(NamedTuple):
-    """A peak of the correlation at a lag of some event counts: a preamble within a chip of there."""
+    """A peak of the correlation at a lag of some event counts: a preamble within a chip of it."""
 
     first_bin: int
     counts: Floats
@@ -171,22 +170,24 @@ class BarkerSynchronizer:
         self._packet = packet
         # Events come behind edges, and late ones agree with the chip that they come in.
         self._chips = 2 * codebook.preamble.astype(np.float64) - 1
-        self._pair = 2 if is_pair_code(codebook.preamble) else 1
+        self._chips_per_part = 2 if is_pair_code(codebook.preamble) else 1
         self._due = due_chips(codebook.preamble)
-        self._bin_us = packet.chip_us / _STEPS
+        self._bin_us = packet.chip_us / _CHIP_STEPS
         rising = np.flatnonzero(np.diff(self._chips) > 0) + 1
         if not len(rising):
             raise ConfigError("synchronization 'barker': a preamble without a rise finds no time")
-        self._least = spec.min_correlation or least_correlation(codebook, packet.frames, packet.pilot_every)
+        self._threshold = spec.min_correlation or least_correlation(
+            codebook, packet.frames, packet.pilot_every
+        )
         # A correlation peak stands alone within this distance.
-        self._guard = _STEPS * guard_chips(codebook.preamble, self._least)
-        self._span = _STEPS * len(self._chips)
+        self._guard = _CHIP_STEPS * guard_chips(codebook.preamble, self._threshold)
+        self._span = _CHIP_STEPS * len(self._chips)
         # Half of a packet's correlations are positive.
-        self._most_known = _STEPS * packet.packet_chips // 2
+        self._max_known = _CHIP_STEPS * packet.packet_chips // 2
         # In a preamble from lag 0 on: of each chip, where it may begin; of each rise, the steps around it.
         self._signs = np.stack([-self._chips, self._chips])[:, :, None]
-        self._begins = np.arange(2 * _STEPS + 1) + _STEPS * np.arange(len(self._chips))[:, None]
-        self._near_rises = _STEPS * rising[:, None] + np.arange(-_STEPS, _STEPS)
+        self._begins = np.arange(2 * _CHIP_STEPS + 1) + _CHIP_STEPS * np.arange(len(self._chips))[:, None]
+        self._rise_steps = _CHIP_STEPS * rising[:, None] + np.arange(-_CHIP_STEPS, _CHIP_STEPS)
 
     def init(self) -> SyncState:
         """State before the first event."""
@@ -195,7 +196,7 @@ class BarkerSynchronizer:
     def step(
         self, state: SyncState, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: int
     ) -> tuple[SyncState, list[SyncLock]]:
-        """Count events, correlate what is complete, give a lock for each preamble (see `Synchronizer`)."""
+        """Count events, correlate what is complete, return a lock for each preamble (see `Synchronizer`)."""
         span, guard = self._span, self._guard
         before_bin, before, next_bin, power, known, clock, stray = state
         until_bin = int(until_us // self._bin_us)
@@ -218,110 +219,112 @@ class BarkerSynchronizer:
         _kernels.count_bins(to_kernel_array(t_us), to_kernel_array(p), where, before, counts)
         if lags - guard > lo:
             rho, peaks = np.empty(lags), np.empty(lags - guard - lo, np.int64)
-            _kernels.correlate(counts, self._chips, self._due, _STEPS, _MIN_EVENTS, rho)
-            past, enough = (power, known, self._most_known), (_OUTSTANDS, self._least)
+            _kernels.correlate(counts, self._chips, self._due, _CHIP_STEPS, _MIN_EVENTS, rho)
+            past, enough = (power, known, self._max_known), (_OUTSTANDING_RMS, self._threshold)
             power, known, many = _kernels.find_peaks(rho, counts, span, lo, guard, past, enough, peaks)
             for lag in peaks[:many].tolist():
                 peak, old = _Peak(first_bin, counts, lag, float(rho[lag])), clock
-                clock, stray = self._accept(clock, stray, peak)
+                clock, stray = self._accept_peak(clock, stray, peak)
                 if clock is not old:
-                    locks.append(self._lock(clock, peak.quality))
+                    locks.append(self._build_lock(clock, peak.quality))
             lo = lags - guard
         return SyncState(first_bin, counts, first_bin + lo, power, known, clock, stray), locks
 
-    def _refine(self, peak: _Peak) -> _Preamble:
-        """Times of one preamble, for positive and negative events apart, us."""
+    def _refine_peak(self, peak: _Peak) -> _Preamble:
+        """Times of a peak's preamble, for positive and negative events apart, us."""
         first_bin, counts, lag, quality = peak
-        (off, off_noise), (on, on_noise) = self._fit(counts, lag)
-        response = counts[1].take(lag + self._near_rises, mode="clip")
-        onset, onset_noise = _jackknife(_onsets(_without_each(response)))
+        (off, off_noise), (on, on_noise) = self._fit_polarities(counts, lag)
+        response = counts[1].take(lag + self._rise_steps, mode="clip")
+        onset, onset_noise = _jackknife(_find_onsets(_leave_one_out(response)))
         if math.isnan(on):
             on, on_noise = off, off_noise
         bin_us, least = self._bin_us, _TIMING_SIGMA_US**2
         return _Preamble(
             on_us=(first_bin + on) * bin_us,
             off_us=(first_bin + off) * bin_us,
-            onset_us=(first_bin + (lag - _STEPS + onset)) * bin_us,
+            onset_us=(first_bin + (lag - _CHIP_STEPS + onset)) * bin_us,
             quality=quality,
             on_noise=least + on_noise * bin_us**2,
             off_noise=least + off_noise * bin_us**2,
             onset_noise=least + onset_noise * bin_us**2,
         )
 
-    def _fit(self, counts: Floats, lag: int) -> list[tuple[float, float]]:
+    def _fit_polarities(self, counts: Floats, lag: int) -> list[tuple[float, float]]:
         """Where near a lag negative events fit a preamble best, and positive ones; NaN where none do.
 
-        In steps, each with its variance by what is found without each pair of chips, as pair codes are made
-        of, or without each chip.
+        In steps, each with its variance by the results without each pair of chips, as pair codes are made of,
+        or without each chip.
         """
-        first, last = max(lag - _STEPS, 0), min(lag + _STEPS + 1, counts.shape[1] - self._span + 1)
+        first, last = max(lag - _CHIP_STEPS, 0), min(lag + _CHIP_STEPS + 1, counts.shape[1] - self._span + 1)
         running = np.zeros((2, last - first + self._span))
         np.cumsum(counts[:, first : first + running.shape[1] - 1], axis=1, out=running[:, 1:])
-        chips = running[:, _STEPS:] - running[:, :-_STEPS]
+        chips = running[:, _CHIP_STEPS:] - running[:, :-_CHIP_STEPS]
         parts = self._signs * chips[:, self._begins[:, : last - first]]
-        if self._pair > 1:
-            parts = parts.reshape(2, -1, self._pair, last - first).sum(2)
-        found = map(_jackknife, _middles(_without_each(parts)).tolist())
+        if self._chips_per_part > 1:
+            parts = parts.reshape(2, -1, self._chips_per_part, last - first).sum(2)
+        found = map(_jackknife, _find_middles(_leave_one_out(parts)).tolist())
         return [(first + middle, noise) for middle, noise in found]
 
-    def _accept(self, clock: _Clock | None, stray: _Peak | None, peak: _Peak) -> tuple[_Clock, _Peak | None]:
-        """Add a preamble to the lock it fits; off it, a better one than its only one, or a second, begins.
+    def _accept_peak(
+        self, clock: _Clock | None, stray: _Peak | None, peak: _Peak
+    ) -> tuple[_Clock, _Peak | None]:
+        """Add a preamble to its lock; off it, a better one than its only one, or a second, begins a new lock.
 
         One symbol on all clusters at once blinks in phase, too, but can agree with 16 chips of 26 only. Most
-        peaks of a lamp are on no grid: only those that may be have their times found.
+        peaks of a lamp are on no grid: only those that may be are refined.
         """
         if clock is None:
-            return self._first(self._refine(peak)), None
-        if self._may_follow(clock.on_us, clock.rate_us, peak, 1):
-            found = self._refine(peak)
-            packets = self._packets_between(clock, found)
+            return self._start_clock(self._refine_peak(peak)), None
+        if self._can_follow(clock.on_us, clock.rate_us, peak, 1):
+            found = self._refine_peak(peak)
+            packets = self._count_packets(clock, found)
             if packets is not None:
-                return self._next(clock, found, packets), None
-        if clock.preambles == 1 and peak.quality > clock.quality + _CLEARLY:
-            return self._first(self._refine(peak)), None
-        if peak.quality < clock.quality - _CLEARLY:
+                return self._update_clock(clock, found, packets), None
+        if clock.preambles == 1 and peak.quality > clock.quality + _CLEAR_DIFFERENCE:
+            return self._start_clock(self._refine_peak(peak)), None
+        if peak.quality < clock.quality - _CLEAR_DIFFERENCE:
             return clock, stray
-        if stray is not None and self._may_follow(self._near_us(stray), 0.0, peak, 2):
-            anew, found = self._first(self._refine(stray)), self._refine(peak)
-            packets = self._packets_between(anew, found)
+        if stray is not None and self._can_follow(self._peak_us(stray), 0.0, peak, 2):
+            restarted, found = self._start_clock(self._refine_peak(stray)), self._refine_peak(peak)
+            packets = self._count_packets(restarted, found)
             if packets is not None:
-                return self._next(anew, found, packets), None
+                return self._update_clock(restarted, found, packets), None
         return clock, peak
 
-    def _near_us(self, peak: _Peak) -> float:
+    def _peak_us(self, peak: _Peak) -> float:
         """Where a peak's preamble begins, to within a chip."""
         return (peak.first_bin + peak.lag) * self._bin_us
 
-    def _may_follow(self, before_us: float, rate_us: float, peak: _Peak, chips: int) -> bool:
+    def _can_follow(self, before_us: float, rate_us: float, peak: _Peak, chips: int) -> bool:
         """Whether a peak may be whole packets after a preamble; the two are known to so many chips."""
         packet_us = self._packet.packet_chips * self._packet.chip_us + rate_us
-        apart_us = self._near_us(peak) - before_us
+        apart_us = self._peak_us(peak) - before_us
         packets = round(apart_us / packet_us)
-        off_us = abs(apart_us - packets * packet_us) - packets * self._most_us()
+        off_us = abs(apart_us - packets * packet_us) - packets * self._max_drift_us()
         return packets > 0 and off_us < (chips + _ON_GRID_CHIPS) * self._packet.chip_us
 
-    def _most_us(self) -> float:
+    def _max_drift_us(self) -> float:
         """How much longer or shorter than nominal a packet may be."""
         return self._spec.clock_tolerance_ppm * 1e-6 * self._packet.packet_chips * self._packet.chip_us
 
-    def _first(self, found: _Preamble) -> _Clock:
+    def _start_clock(self, found: _Preamble) -> _Clock:
         noise = found.on_noise
-        apart = found.off_us - found.on_us
+        off_delay_us = found.off_us - found.on_us
         return _Clock(
             packet=0,
             preambles=1,
             on_us=found.on_us,
             rate_us=0.0,
             # The bound is two sigmas of what clocks have.
-            variances=(noise, 0.0, (self._most_us() / 2) ** 2),
-            apart=_Level(0.0, self._packet.chip_us**2)
-            if math.isnan(apart)
-            else _Level(apart, noise + found.off_noise),
-            onset=_Level(found.onset_us - found.on_us, noise + found.onset_noise),
+            variances=(noise, 0.0, (self._max_drift_us() / 2) ** 2),
+            off_delay=_WanderingLevel(0.0, self._packet.chip_us**2)
+            if math.isnan(off_delay_us)
+            else _WanderingLevel(off_delay_us, noise + found.off_noise),
+            onset=_WanderingLevel(found.onset_us - found.on_us, noise + found.onset_noise),
             quality=found.quality,
         )
 
-    def _ahead(self, clock: _Clock, packets: int) -> tuple[float, float, float, float]:
+    def _predict(self, clock: _Clock, packets: int) -> tuple[float, float, float, float]:
         """Time of the preamble so many packets after the lock's, and the variances there (see `_Clock`)."""
         time, both, rate = clock.variances
         nominal_us = self._packet.packet_chips * self._packet.chip_us
@@ -329,29 +332,29 @@ class BarkerSynchronizer:
         time += 2 * packets * both + packets**2 * rate + packets * _LATENCY_SIGMA_US**2
         return clock.on_us + packets * (nominal_us + clock.rate_us), time, both + packets * rate, rate
 
-    def _packets_between(self, clock: _Clock, found: _Preamble) -> int | None:
-        """Whole packets from a lock's newest preamble to another, None if it is off the grid."""
+    def _count_packets(self, clock: _Clock, found: _Preamble) -> int | None:
+        """Whole packets from a lock's newest preamble to another; None if that is off the grid."""
         apart = found.on_us - clock.on_us
         packets = round(apart / (self._packet.packet_chips * self._packet.chip_us + clock.rate_us))
         if packets <= 0:
             return None
-        expected, variance, _, _ = self._ahead(clock, packets)
-        off_grid = abs(found.on_us - expected) - min(2 * math.sqrt(variance), packets * self._most_us())
+        expected, variance, _, _ = self._predict(clock, packets)
+        off_grid = abs(found.on_us - expected) - min(2 * math.sqrt(variance), packets * self._max_drift_us())
         return packets if off_grid < _ON_GRID_CHIPS * self._packet.chip_us else None
 
-    def _next(self, clock: _Clock, found: _Preamble, packets: int) -> _Clock:
+    def _update_clock(self, clock: _Clock, found: _Preamble, packets: int) -> _Clock:
         """The lock with a preamble more."""
         noise = found.on_noise
-        expected, time, both, rate = self._ahead(clock, packets)
+        expected, time, both, rate = self._predict(clock, packets)
         late = found.on_us - expected
-        if late**2 > _CHANGED_SIGMAS**2 * (time + noise):
+        if late**2 > _JUMP_SIGMAS**2 * (time + noise):
             # The latency's jump adds to the time's variance alone, so that hardly any of it goes to the rate.
             time = late**2 - noise
         spread = time + noise
-        most_us = self._most_us()
+        most_us = self._max_drift_us()
         rate_us = min(max(clock.rate_us + both / spread * late, -most_us), most_us)
         walk = packets * _LATENCY_SIGMA_US**2
-        apart = found.off_us - found.on_us
+        off_delay_us = found.off_us - found.on_us
         preambles = min(clock.preambles + 1, _QUALITY_PACKETS)
         return _Clock(
             packet=clock.packet + packets,
@@ -359,31 +362,31 @@ class BarkerSynchronizer:
             on_us=expected + time / spread * late,
             rate_us=rate_us,
             variances=(time * noise / spread, both * noise / spread, rate - both**2 / spread),
-            apart=clock.apart
-            if math.isnan(apart)
-            else clock.apart.measured(apart, walk, noise + found.off_noise),
-            onset=clock.onset.measured(found.onset_us - found.on_us, walk, noise + found.onset_noise),
+            off_delay=clock.off_delay
+            if math.isnan(off_delay_us)
+            else clock.off_delay.update(off_delay_us, walk, noise + found.off_noise),
+            onset=clock.onset.update(found.onset_us - found.on_us, walk, noise + found.onset_noise),
             quality=clock.quality + (found.quality - clock.quality) / preambles,
         )
 
-    def _lock(self, clock: _Clock, quality: float) -> SyncLock:
+    def _build_lock(self, clock: _Clock, quality: float) -> SyncLock:
         onset = clock.onset.value
         return SyncLock(
             packet_t_us=clock.on_us + onset,
             chip_us=self._packet.chip_us + clock.rate_us / self._packet.packet_chips,
             delay_on_us=-onset,
-            delay_off_us=clock.apart.value - onset,
+            delay_off_us=clock.off_delay.value - onset,
             quality=quality,
         )
 
 
-def _without_each(parts: Floats) -> Floats:
+def _leave_one_out(parts: Floats) -> Floats:
     """The sum of parts (..., n, m), then the sums without each of them, (..., 1 + n, m)."""
     whole = parts.sum(-2, keepdims=True)
     return np.concatenate([whole, whole - parts], -2)
 
 
-def _middles(fits: Floats) -> Floats:
+def _find_middles(fits: Floats) -> Floats:
     """Where correlations (..., lags) are best; NaN where one is positive nowhere.
 
     The top is flat where a window holds all events of an edge: its middle is the best window.
@@ -395,8 +398,8 @@ def _middles(fits: Floats) -> Floats:
     return found
 
 
-def _onsets(responses: Floats) -> list[float]:
-    """Where counts (n, steps) first reach half of their most, over what comes always: a quartile."""
+def _find_onsets(responses: Floats) -> list[float]:
+    """Where counts (n, steps) first reach half of their maximum, over the background: a quartile."""
     found = []
     for response in responses.tolist():
         ordered = sorted(response)
@@ -409,9 +412,9 @@ def _onsets(responses: Floats) -> list[float]:
     return found
 
 
-def _jackknife(found: list[float]) -> tuple[float, float]:
-    """What was found of all, and its variance by what was found without each; NaN of these says nothing."""
-    whole, *without = found
+def _jackknife(estimates: list[float]) -> tuple[float, float]:
+    """The estimate of all, and its variance by those without each; NaN among these is ignored."""
+    of_all, *without = estimates
     many, total, squares = 0, 0.0, 0.0
     for value in without:
         if value == value:
@@ -419,4 +422,4 @@ def _jackknife(found: list[float]) -> tuple[float, float]:
     for value in without:
         if value == value:
             squares += (value - total / many) ** 2
-    return whole, (many - 1) * squares / many if many else 0.0
+    return of_all, (many - 1) * squares / many if many else 0.0

@@ -10,7 +10,7 @@ from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, Range
 
-_NONE = Range(math.nan, math.nan, 0)
+_NO_RANGE = Range(math.nan, math.nan, 0)
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,6 @@ class NoRanging(Ranging):
         """Nothing to precompute."""
 
         def measure(_: FrameView) -> Range:
-            return _NONE
+            return _NO_RANGE
 
         return measure

@@ -13,12 +13,12 @@ from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, Range
 
-_NONE = Range(float("nan"), float("nan"), 0)
+_NO_RANGE = Range(float("nan"), float("nan"), 0)
 
 
 @dataclass(frozen=True)
 class CentroidRanging(Ranging):
-    """Similarity (shift, turn, scale) that brings the layout to the centres of gravity best.
+    """Similarity (shift, turn, scale) that maps the layout best to the centres of gravity.
 
     Each cluster's centre is the mean of its map, whatever its LEDs. To a side where it has no neighbour it
     looks larger than it is: those count that have neighbours on the same sides as most have. From a start by
@@ -56,10 +56,10 @@ class CentroidRanging(Ranging):
                 f" {skip}), expected at least min_clusters = {least}"
             )
         if not bar.has_distinct_centres:
-            raise ConfigError("ranging 'centroid' needs clusters apart: use 'none' for this layout")
+            raise ConfigError("ranging 'centroid' needs clusters layout_steps: use 'none' for this layout")
         layout = centres[:, 0] + 1j * centres[:, 1]
         i, j = np.triu_indices(bar.clusters, 1)
-        apart = layout[j] - layout[i]
+        layout_steps = layout[j] - layout[i]
 
         def measure(view: FrameView) -> Range:
             maps = view.presence.pixels.astype(np.float64)
@@ -68,17 +68,17 @@ class CentroidRanging(Ranging):
             seen = np.flatnonzero((weight > 0) & same)
             seen = seen[skip : len(seen) - skip]
             if len(seen) < least:
-                return _NONE
+                return _NO_RANGE
             down = maps.sum(2)[seen] @ np.arange(maps.shape[1]) / weight[seen]
             right = maps.sum(1)[seen] @ np.arange(maps.shape[2]) / weight[seen]
             image, place = right + 1j * down, layout[seen]
-            # The start is robust: medians of pairs half of what is seen apart, and of what they leave.
+            # The start is robust: medians of pairs half of what is seen layout_steps, and of what they leave.
             at = np.full(bar.clusters, np.nan, np.complex128)
             at[seen] = image
-            step = np.full(len(apart), np.nan, np.complex128)
-            np.divide(at[j] - at[i], apart, out=step, where=apart != 0)
+            step = np.full(len(layout_steps), np.nan, np.complex128)
+            np.divide(at[j] - at[i], layout_steps, out=step, where=layout_steps != 0)
             both = np.isfinite(step)
-            both &= np.abs(apart) >= 0.5 * np.abs(apart[both]).max()
+            both &= np.abs(layout_steps) >= 0.5 * np.abs(layout_steps[both]).max()
             scale = complex(np.median(step[both].real), np.median(step[both].imag))
             rest = image - scale * place
             shift = complex(np.median(rest.real), np.median(rest.imag))
@@ -86,7 +86,7 @@ class CentroidRanging(Ranging):
                 off = np.abs(image - shift - scale * place)
                 keep = off <= 3 * np.median(off) + 1e-9
                 if keep.sum() < least:
-                    return _NONE
+                    return _NO_RANGE
                 spread = place[keep] - place[keep].mean()
                 power = float((np.abs(spread) ** 2).sum())
                 scale = complex(np.conj(spread) @ image[keep]) / power
@@ -96,7 +96,7 @@ class CentroidRanging(Ranging):
             variance = float((off**2).sum()) / max(2 * kept - 4, 1)
             size = abs(scale)
             if not size > 0:
-                return _NONE
+                return _NO_RANGE
             distance = camera.focal_px / size
             return Range(distance, distance * float(np.sqrt(variance / power)) / size, kept)
 

@@ -21,13 +21,13 @@ Slots = Annotated[
 ]
 
 
-def dimmed_chips(values: ArrayLike, slots: int) -> NDArray[np.uint8]:
+def pulse_chips(values: ArrayLike, slots: int) -> NDArray[np.uint8]:
     """Chips of bipolar values along the last axis, one of `slots` lit each.
 
     It is the last of all for +1, the last of the first half for -1: every value starts dark, so that the rise
     of its pulse is its own. Two slots are a pair code.
 
-    >>> dimmed_chips([1, -1], 4).tolist()
+    >>> pulse_chips([1, -1], 4).tolist()
     [0, 0, 0, 1, 0, 1, 0, 0]
     """
     v = np.asarray(values)
@@ -49,7 +49,7 @@ class DimmedPilots(Pilots):
 
     def preamble(self) -> NDArray[np.uint8]:
         """Barker-13 of pulses, uint8 (13 * slots,)."""
-        return dimmed_chips(BARKER13, self.slots)
+        return pulse_chips(BARKER13, self.slots)
 
     def codes(self, clusters: int) -> NDArray[np.uint8]:
         """uint8 (clusters, N), N = 8 * slots for up to 16 clusters."""
@@ -57,7 +57,7 @@ class DimmedPilots(Pilots):
         while 2 * order < clusters:
             order *= 2
         rows = hadamard(order)
-        return dimmed_chips(np.concatenate([rows, -rows])[:clusters], self.slots)
+        return pulse_chips(np.concatenate([rows, -rows])[:clusters], self.slots)
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,6 @@ class DimmedWh4x2(Modulation):
         """uint8 (64, 8 * slots)."""
         rows = hadamard(4)
         words = np.concatenate([rows, -rows])
-        return dimmed_chips(
+        return pulse_chips(
             np.concatenate([np.repeat(words, 8, axis=0), np.tile(words, (8, 1))], axis=1), self.slots
         )

@@ -1,4 +1,4 @@
-"""Which cluster does a part of the image show, by the edges of pilots of any chips."""
+"""Separation of clusters by the edges of pilots of any chips."""
 
 from dataclasses import dataclass
 from math import log
@@ -25,9 +25,9 @@ class EdgeSeparation(Separation):
     """Agreement of each grid cell's signs with every pilot's edges, as a probability by Bayes' rule.
 
     In each chip of the pilot a cell brightens, darkens, or stays as it is. Where a pilot has an edge, a cell
-    that shows its cluster does as the edge says, but for errors; where it has none, light of neighbours and
-    late events come with either sign (in nine cells of ten, at 50 m), as they do in a cell that shows no
-    cluster. A cell that stays as it is says nothing. All clusters, and none, are equally likely before.
+    that shows its cluster follows the edge, but for errors; where it has none, light of neighbours and late
+    events come with either sign (in nine cells of ten, at 50 m), as they do in a cell that shows no cluster.
+    A cell that stays as it is carries no information. All clusters, and none, are equally likely before.
     """
 
     grid_px: Annotated[int, Field(ge=2, le=16, description="Side of a grid cell.")] = 2

@@ -18,12 +18,12 @@ from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Curvature, FrameView, Range, replace_fields, to_kernel_array
 
-_NONE = Range(float("nan"), float("nan"), 0)
+_NO_RANGE = Range(float("nan"), float("nan"), 0)
 
-_STARTING_GAIN = 0.8
+_START_GAIN = 0.8
 """Share of a full value that a cluster's rows show, with a fifth of the negative events missing."""
 
-_TAIL = 3.0
+_TAIL_WIDTH = 3.0
 """Width of the tails of a boundary's profile, in cores: the log of the light's ratio, clipped at a full
 value, is steep in the middle, and the lens gives it tails."""
 
@@ -39,26 +39,27 @@ class JointScaleRanging(Ranging):
 
     A pixel across a boundary sees light of both clusters, shares f and 1 - f. Where their codes differ, its
     log signal moves by ln(f / (1 - f)) at the edge in a value's middle, and so the sum of its events crosses
-    zero at the boundary with a slope: that says where the boundary lies, to a fraction of a pixel. All rows
+    zero at the boundary with a slope: that gives the place of the boundary to a fraction of a pixel. All rows
     and values are fitted by one straight scale. Rows beyond the middles of the outermost clusters, where
-    there is no neighbour, are left out, so that an outer edge cannot bias it. What remains of the
-    motion within the frame is known from the track, its rate is fitted, and what is neither is found value by
-    value, as far as it stands out of the noise.
+    there is no neighbour, are left out, so that an outer edge cannot bias it. The rest of the motion within
+    the frame is known from the track, its rate is fitted, and what is neither is found value by value, as far
+    as it exceeds the noise.
 
     Positive and negative events are not alike in number and time, and an edge leaves late events and blind
     pixels to the next one a chip later. Both shift boundaries, by up to a twentieth of a pixel: those that
     step up to one side and those that step down to the other, and into the cluster that repeats a value. As
-    pilots are the same in every frame, the scale and the bend would be off; so both shifts are fitted, too.
+    pilots are the same in every frame, the scale and the curvature would be off; so both shifts are fitted,
+    too.
 
     Cells out of line with the layout, boundaries out of line with the others, and info values of clusters
     whose symbol is not known are left out. There is no distance where the fit leaves the cells, or does not
     explain the values.
 
-    The pilots have to be pair codes. Of a frame whose codewords are others, its pilot alone is read.
+    The pilots have to be pair codes. In a frame with other codewords, only the pilot is used.
 
-    Of a layout of several even columns, each gives a distance, and these are averaged by their boundaries;
-    where they differ by more than their sigmas say, sigma is as much larger. From side to side nothing is
-    measured: a panel that is turned away looks narrower, but not lower.
+    For a layout of several even columns, each gives a distance, and these are averaged by their boundaries;
+    where they differ by more than their sigmas, sigma grows as much. From side to side nothing is measured: a
+    panel that is turned away looks narrower, but not lower.
 
     Sigma is the mean of two estimates, which see different errors: one takes each row as an observation
     (sandwich estimator), as a row's values share one pixel phase; the other is the scatter of the boundaries.
@@ -85,24 +86,24 @@ class JointScaleRanging(Ranging):
         if not bar.even_columns:
             raise ConfigError(
                 "ranging 'joint-scale' needs an even column of three clusters or more; "
-                + _instead(bar, codebook)
+                + _suggest_ranging(bar, codebook)
             )
         codebook.require_pairs("ranging", "joint-scale", "poc", codes=("pilots",))
-        measures = [self._of_column(camera, codebook, *column) for column in bar.even_columns]
+        measures = [self._compile_column(camera, codebook, *column) for column in bar.even_columns]
         if len(measures) == 1 and len(bar.even_columns[0][0]) == bar.clusters:
             return measures[0]
         columns = [ids for ids, _ in bar.even_columns]
 
         def measure(view: FrameView) -> Range:
-            parts = [one(_part(view, ids)) for one, ids in zip(measures, columns, strict=True)]
-            return _together([part for part in parts if part.sigma_m > 0])
+            parts = [one(_select_column(view, ids)) for one, ids in zip(measures, columns, strict=True)]
+            return _average_columns([part for part in parts if part.sigma_m > 0])
 
         return measure
 
-    def _of_column(
+    def _compile_column(
         self, camera: CameraModel, codebook: Codebook, column: NDArray[np.int64], spacing_m: float
     ) -> Measure:
-        """What measures one column by the views of its clusters alone."""
+        """Precompute for one column, measured by the views of its clusters alone."""
         clusters, least = len(column), min(self.min_boundaries, len(column) - 1)
         pilots = codebook.pilot_values[column].astype(np.float64)
         words = codebook.codeword_values.astype(np.float64)
@@ -113,7 +114,7 @@ class JointScaleRanging(Ranging):
         def measure(view: FrameView) -> Range:
             found = find_bar(view, chips)
             if found is None:
-                return _NONE
+                return _NO_RANGE
             sums, offset_px, line, seen = found
             height, (first, spacing, _, tilt, _) = sums.shape[1], line.tolist()
             values = np.empty((n, height))
@@ -125,15 +126,15 @@ class JointScaleRanging(Ranging):
                 values, offset_px = to_kernel_array(values[:, ::-1]), -offset_px
             decoded = pilots, words, to_kernel_array(view.soft.symbols), seen
             centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
-            fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0, 0.0, 0.0])
+            fit = np.array([spacing, centre, 0.0, _START_GAIN, 0.0, 0.0, 0.0])
             (variance, seen_boundaries, wider_px), by_boundary = _kernels.fit_bar(
-                decoded, offset_px, values, profile(_CORE_SHARE), (self.blur_px, dim), least, fit
+                decoded, offset_px, values, boundary_profile(_CORE_SHARE), (self.blur_px, dim), least, fit
             )
             spacing_px, centre_px, *_ = fit.tolist()
-            # From the start, which cells gave, an end moves by the size of a cell and a pixel of blur.
+            # From the start, by cells, an end moves by the size of a cell and a pixel of blur at most.
             farthest = abs(spacing_px - spacing) * (clusters - 1) / 2 + abs(centre_px - centre)
             if math.isnan(variance) or farthest > view.presence.grid_px + 1:
-                return _NONE
+                return _NO_RANGE
             # Rows measure the bar along one axis; a tilted bar is longer by its slope.
             stretch = math.hypot(1.0, tilt)
             distance = camera.distance_m(spacing_m, spacing_px * stretch)
@@ -161,11 +162,11 @@ class JointScaleRanging(Ranging):
 def find_bar(
     view: FrameView, chips: int
 ) -> tuple[NDArray[np.int16], Floats, Floats, NDArray[np.bool_]] | None:
-    """A bar in the cells of a frame, None with fewer than three clusters in line.
+    """Find a bar in the cells of a frame; None with fewer than three clusters in line.
 
     Returns:
         Sums of the first `chips` chips and the offset of the bar along itself in each, turned so that it lies
-        along the rows; its line, float64 (5,), as `_kernels.read_rows` takes it; and which clusters are seen.
+        along the rows; its line, float64 (5,), as for `_kernels.read_rows`; and which clusters are seen.
     """
     selected, sums = to_kernel_array(view.presence.selected), to_kernel_array(view.sums[:chips])
     offset_px, middles = to_kernel_array(view.offset_px[1, :chips]), np.empty((len(selected), 2))
@@ -178,15 +179,15 @@ def find_bar(
 
 
 @cache
-def profile(core_share: float) -> Floats:
-    """Of a boundary with a core of width 1: -1 to 1 across it, and the slope of that, float64 (2, n).
+def boundary_profile(core_share: float) -> Floats:
+    """Profile of a boundary with a core of width 1: -1 to 1 across it, and its slope, float64 (2, n).
 
-    From its middle to `_kernels.REACH`; straight pieces between leave a hundred-thousandth.
+    From its middle to `_kernels.PROFILE_REACH`; linear interpolation is off by a hundred-thousandth.
     """
     # As SciPy's to the last bits, without the import.
     erf = np.vectorize(math.erf)
-    z = np.linspace(0, _kernels.REACH, 2049)
-    parts = ((core_share, 1.0), (1 - core_share, _TAIL))
+    z = np.linspace(0, _kernels.PROFILE_REACH, 2049)
+    parts = ((core_share, 1.0), (1 - core_share, _TAIL_WIDTH))
     across = sum(share * erf(z / wide / np.sqrt(2)) for share, wide in parts)
     slope = sum(share * 2 * np.exp(-0.5 * (z / wide) ** 2) / wide for share, wide in parts) / np.sqrt(
         2 * np.pi
@@ -194,8 +195,8 @@ def profile(core_share: float) -> Floats:
     return np.stack([across, slope])
 
 
-def _part(view: FrameView, clusters: NDArray[np.int64]) -> FrameView:
-    """What a view shows of some of the clusters, the first of them first."""
+def _select_column(view: FrameView, clusters: NDArray[np.int64]) -> FrameView:
+    """The view of some of the clusters, in this order."""
     presence, soft = view.presence, view.soft
     return replace_fields(
         view,
@@ -204,14 +205,14 @@ def _part(view: FrameView, clusters: NDArray[np.int64]) -> FrameView:
     )
 
 
-def _together(parts: Sequence[Range]) -> Range:
-    """The mean of columns' distances by their boundaries; sigma is the larger by as much as they differ.
+def _average_columns(parts: Sequence[Range]) -> Range:
+    """The mean of columns' distances by their boundaries; sigma grows by as much as they differ.
 
-    What n even boundaries tell grows with the cube of n. A column's own sigma, from the scatter of a few, is
-    too unsure to weigh by; all of them together say what a boundary is worth.
+    The information of n even boundaries grows with the cube of n. A column's own sigma, from the scatter of a
+    few, is too uncertain for a weight; all of them together give the sigma of a boundary.
     """
     if not parts:
-        return _NONE
+        return _NO_RANGE
     distance, sigma, pairs = np.array([(part.distance_m, part.sigma_m, part.pairs) for part in parts]).T
     share = pairs**3
     weight = share / np.mean(sigma**2 * share)
@@ -221,7 +222,7 @@ def _together(parts: Sequence[Range]) -> Range:
     return Range(mean, sigma_m, int(pairs.sum()), parts[0].late_chips)
 
 
-def _instead(bar: BarLayout, codebook: Codebook) -> str:
+def _suggest_ranging(bar: BarLayout, codebook: Codebook) -> str:
     """The ranging for a layout that this one refuses, if any is."""
     if bar.clusters < 2:
         return "no ranging measures the distance of one cluster: use 'none' for this layout"

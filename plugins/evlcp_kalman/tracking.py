@@ -25,8 +25,8 @@ class KalmanTracking(Tracking):
 
     The measurement's variance is pooled over frames, as a single frame's sigma is itself a rough estimate,
     and weights by it would favour frames that look better than they are. A measurement far from its
-    prediction is left out. In the image, a pothole changes the speed at once: a measurement that such a jolt
-    explains, and nothing else, is followed, as if the speed had become unknown by so much at the last one.
+    prediction is left out. In the image, a pothole changes the speed at once: a measurement that only such a
+    jolt explains is followed, as if the speed had become unknown by so much at the last one.
     """
 
     acceleration_m2_s3: Annotated[
@@ -90,7 +90,7 @@ class _ConstantVelocity(Filter):
     def predict(self, state: _State | None, t_us: float) -> tuple[NDArray[np.float64], float] | None:
         if state is None:
             return None
-        mean, covariance = self._ahead(state, t_us)
+        mean, covariance = self._predict_state(state, t_us)
         return mean[0], float(np.sqrt(covariance[0, 0]))
 
     def step(
@@ -109,7 +109,7 @@ class _ConstantVelocity(Filter):
             return state, value.copy(), sigma
         count = min(state.count + 1, self.pooled)
         variance = state.variance + (sigma**2 - state.variance) / count
-        mean, covariance = self._ahead(state, t_us)
+        mean, covariance = self._predict_state(state, t_us)
         innovation = value - mean[0]
         off = float(np.abs(innovation).max())
         spread = covariance[0, 0] + variance
@@ -119,8 +119,8 @@ class _ConstantVelocity(Filter):
             spread = covariance[0, 0] + variance
         missed = 0
         if off > self.gate * np.sqrt(spread):
-            # No jolt explains it either: what it says is not taken, and neither is that there was one.
-            mean, covariance = self._ahead(state, t_us)
+            # No jolt explains it either: neither the measurement nor a jolt is taken in.
+            mean, covariance = self._predict_state(state, t_us)
             missed = state.missed + 1
             if missed > self.pooled // 2:
                 # So many in a row are not outliers: what is tracked has changed.
@@ -132,7 +132,7 @@ class _ConstantVelocity(Filter):
         state = _State(t_s, mean, covariance, variance, count, missed)
         return state, mean[0].copy(), float(np.sqrt(covariance[0, 0]))
 
-    def _ahead(self, state: _State, t_us: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _predict_state(self, state: _State, t_us: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         dt = t_us * 1e-6 - state.t_s
         move = np.array([[1.0, dt], [0.0, 1.0]])
         noise = self.density * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, abs(dt)]])

@@ -1,4 +1,4 @@
-"""Middles and cuts of maps, cross spectra, the sub-pixel peak fit and a robust mean: compiled."""
+"""Middles and cuts of maps, cross spectra, the sub-pixel fit of peaks, and a robust mean: compiled."""
 
 from typing import Any
 
@@ -13,13 +13,14 @@ Array = NDArray[Any]
 
 @njit
 def find_middles(maps: Array, apart_m: Array, min_pixels: int, out: Array) -> tuple[float, int, int]:
-    """Weighted median (row, column) of maps, -1 where one has too few lit pixels, `out` (K, 2).
+    """Weighted median (row, column) of maps, -1 with too few lit pixels, `out` (K, 2).
 
     Unlike the mean, the median is robust against stray pixels.
 
     Returns:
-        The scale that all clusters agree on, px a metre, of those `apart_m` (K, K): the median of the farther
-        half of pairs, 0 without any; how far from their middles maps are lit, down or up and to a side.
+        The scale that all clusters agree on, px a metre, by their distances `apart_m` (K, K): the median of
+        the farther half of pairs, 0 without any; how far from their middles maps are lit, down or up and to a
+        side.
     """
     clusters, height, width = maps.shape
     many, seen, reach = 0, np.empty(clusters + 1, np.int64), np.zeros(2, np.int64)
@@ -64,7 +65,7 @@ def find_middles(maps: Array, apart_m: Array, min_pixels: int, out: Array) -> tu
 
 @njit
 def cut_maps(maps: Array, middles: Array, out: Array) -> None:
-    """Windows of maps around their middles, `out` (height, n, width): dark outside a map, or without one."""
+    """Cut windows of maps around their middles, `out` (height, n, width): dark outside, or without one."""
     n, height, width = maps.shape
     rows, _, columns = out.shape
     for k in range(n):
@@ -78,12 +79,12 @@ def cut_maps(maps: Array, middles: Array, out: Array) -> None:
 
 @njit
 def cross_spectra(turned: Array, first: Array, second: Array, no_phase: float, out: Array) -> None:
-    """Phases of pairs of images, conj(first) * second, of their harmonics (down, images, across).
+    """Phases of pairs of images, conj(first) * second, in their harmonics (down, images, across).
 
-    `turned` (2, 2, down, images, across) are images turned across by cosine and sine, of what was turned down
-    by cosine and sine; `out` (2, down, pairs, 2, across) makes real and imaginary parts if it is turned back
-    across by cosine and sine: it is of harmonics to both sides. What is less than `no_phase` of the largest
-    of a spectrum has no phase, and becomes 0. `turned` is written over.
+    `turned` (2, 2, down, images, across) are images multiplied across by cosine and sine, after being
+    multiplied down by cosine and sine; `out` (2, down, pairs, 2, across) gives real and imaginary parts when
+    it is multiplied back across by cosine and sine: it has harmonics to both sides. What is less than
+    `no_phase` of the largest of a spectrum has no phase, and becomes 0. `turned` is overwritten.
     """
     _, _, down, n, across = turned.shape
     many, unit = n * across, turned.reshape(4, down, n * across)
@@ -124,11 +125,11 @@ def cross_spectra(turned: Array, first: Array, second: Array, no_phase: float, o
 def fit_peaks(
     correlation: Array, size: tuple[int, int], most: tuple[int, int], samples: int, shifts: Array
 ) -> None:
-    """Peaks of correlations (2 n + 1, pairs, 2 m + 1), `shifts` (pairs, 2): down and right of the middle, px.
+    """Find peaks of correlations (2 n + 1, pairs, 2 m + 1), `shifts` (pairs, 2): down, right of the middle.
 
     A peak is sought where there are so many `samples` to each side; these, of its row and its column, are
     fitted (least squares) by the Dirichlet kernel of their band: the sum of 2 `most` + 1 harmonics out of
-    `size`. The gain that fits best follows from the shift, so Gauss-Newton steps run over the shift alone
+    `size`. The best gain follows from the shift, so that Gauss-Newton steps run over the shift alone
     (variable projection). The sines of the samples follow from those of the first by rotation.
     """
     rows, pairs, columns = correlation.shape
@@ -194,10 +195,11 @@ def mean_distance(
 ) -> tuple[float, float, int]:
     """Weighted mean of pairs' distances, m, without extremes and outliers, and its delete-one-cluster sigma.
 
-    `pairs` are first and second cluster, and spacing, m; images lie as far apart as middles (K, 2) of maps,
+    `pairs` are first and second cluster, and spacing, m; images are as far apart as middles (K, 2) of maps,
     and `beyond_px` (pairs, 2). `places` are the scale of all clusters, px a metre; by how much, m, pairs may
-    be out of the place that it gives; and how many must not be. `rules` are the power of a spacing to which
-    it counts, how many are dropped at each end, and interquartile ranges beyond the quartiles for an outlier.
+    differ from the distance that it gives; and how many must not. `rules` are the power of a spacing that
+    weights it, how many are dropped at each end, and interquartile ranges beyond the quartiles for an
+    outlier.
 
     Returns:
         (mean, sigma, values kept), NaN and 0 of too few; sigma is NaN if no two clusters can be left out.
@@ -230,7 +232,7 @@ def mean_distance(
         quartiles[i] = (above - below) * (place - int(place)) + below
     low, high = quartiles
     room, kept, total, weighted = iqr * (high - low), 0, 0.0, 0.0
-    own, own_weighted = np.zeros(clusters), np.zeros(clusters)
+    own_weight, own_sum = np.zeros(clusters), np.zeros(clusters)
     for _ in range(2):
         for i in range(begin, end):
             q = order[i]
@@ -238,17 +240,17 @@ def mean_distance(
                 weight = apart_m[q] ** power
                 kept, total, weighted = kept + 1, total + weight, weighted + weight * values[q]
                 for k in (first[q], second[q]):
-                    own[k] += weight
-                    own_weighted[k] += weight * values[q]
+                    own_weight[k] += weight
+                    own_sum[k] += weight * values[q]
         if kept > 0:
             break
         # Narrow bounds may call all of a few values outliers of one another: keep the middle half then.
         room = high - low
     m, mean, squares = 0, 0.0, 0.0
     for k in range(clusters):
-        if own[k] > 0 and total - own[k] > 1e-9 * total:
-            without = (weighted - own_weighted[k]) / (total - own[k])
+        if own_weight[k] > 0 and total - own_weight[k] > 1e-9 * total:
+            mean_without = (weighted - own_sum[k]) / (total - own_weight[k])
             m += 1
-            squares += (without - mean) ** 2 * (m - 1) / m
-            mean += (without - mean) / m
+            squares += (mean_without - mean) ** 2 * (m - 1) / m
+            mean += (mean_without - mean) / m
     return weighted / total, np.sqrt((m - 1) / m * squares) if m > 1 else np.nan, kept

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from evlcp_poc import _kernels
 
-_NO_PHASE = 1e-5
+_MIN_AMPLITUDE = 1e-5
 """Amplitude, in the largest of a spectrum, below which there is no phase: that of rounding."""
 
-_CYCLES = 0.5
+_BAND_CYCLES = 0.5
 """End of the band that blobs fill, cycles a blob size: half the main lobe of a box's spectrum, where its
 amplitude is still 2 / pi of the peak. The noise of a phase is inverse to the amplitude, and all phases weigh
 the same."""
@@ -30,53 +30,53 @@ def phase_only_correlation(
 ) -> Images:
     """Phase-only correlation of pairs of images, float32 (height, n, width) -> (shifts, pairs, shifts).
 
-    The peak of a pair lies where its second image lies relative to its first, and has the shape of the
-    Dirichlet kernel of the band kept. Images are small, and of their shifts only few are asked for: products
-    with matrices transform them there and back in a third of the time that fast transforms of all take.
+    The peak of a pair is where its second image is relative to its first, and has the shape of the Dirichlet
+    kernel of the band kept. Images are small, and only few of their shifts are needed: products with matrices
+    transform them there and back in a third of the time that fast transforms of all take.
 
     Args:
-        images: The images, or the part of all of them beside which they are dark.
+        images: The images, or the part of all of them outside of which they are dark.
         size: Height and width of the images.
         pairs: First and second image of each pair.
-        most: Highest harmonics kept, down and across; at the most those of `full_band`.
+        most: Highest harmonics kept, down and across; at most those of `full_band`.
         down: Shifts down.
         right: Shifts to the right.
     """
     height, n, width = images.shape
-    there_down, there_across, back_down, back_across = _turns(*size, most, down, right)
+    there_down, there_across, back_down, back_across = _transforms(*size, most, down, right)
     half = there_down[:, :height] @ images.reshape(height, -1)
     turned = (half.reshape(-1, width) @ there_across[:, :width]).reshape(2, 2, -1, n, most[1] + 1)
     cross = np.empty((2, most[0] + 1, len(pairs[0]), 2, most[1] + 1), np.float32)
-    _kernels.cross_spectra(turned, *pairs, _NO_PHASE, cross)
+    _kernels.cross_spectra(turned, *pairs, _MIN_AMPLITUDE, cross)
     rows = cross.reshape(-1, 2 * (most[1] + 1)) @ back_across
     return (back_down @ rows.reshape(len(half), -1)).reshape(len(down), len(pairs[0]), -1)
 
 
 @lru_cache(maxsize=64)
-def _turns(
+def _transforms(
     height: int, width: int, most: tuple[int, int], down: range, right: range
 ) -> tuple[Images, Images, Images, Images]:
-    """What transforms images down and across, and what spectra across and down: harmonics from 0 on."""
-    of_down, of_across = range(most[0] + 1), range(most[1] + 1)
-    there_down = _cosine_and_sine(height, of_down, range(height), 0)
-    there_across = _cosine_and_sine(width, range(width), of_across, 0).reshape(2, width, -1)
+    """Matrices that transform images down and across, and spectra across and down: harmonics from 0 on."""
+    harmonics_down, harmonics_across = range(most[0] + 1), range(most[1] + 1)
+    there_down = _cosines_and_sines(height, harmonics_down, range(height), 0)
+    there_across = _cosines_and_sines(width, range(width), harmonics_across, 0).reshape(2, width, -1)
     # All harmonics but 0 are on both sides; those down are conjugates.
-    weight = np.where(of_down, 2, 1) / (height * width)
-    back_down = _cosine_and_sine(height, down, of_down, 1) * [*weight, *-weight]
-    back_across = _cosine_and_sine(width, of_across, right, 0)
+    weight = np.where(harmonics_down, 2, 1) / (height * width)
+    back_down = _cosines_and_sines(height, down, harmonics_down, 1) * [*weight, *-weight]
+    back_across = _cosines_and_sines(width, harmonics_across, right, 0)
     back_across[0] /= 2
-    turns = there_down, there_across, back_down, back_across
-    one, two, three, four = (turn.astype(np.float32) for turn in turns)
+    matrices = there_down, there_across, back_down, back_across
+    one, two, three, four = (matrix.astype(np.float32) for matrix in matrices)
     return one, two, three, four
 
 
-def _cosine_and_sine(size: int, one: range, other: range, axis: int) -> Floats:
-    """Of the turn that each harmonic makes at each place of so many, joined along an axis."""
+def _cosines_and_sines(size: int, one: range, other: range, axis: int) -> Floats:
+    """Of each harmonic at each place out of `size`, joined along an axis."""
     angle = 2 * np.pi / size * (np.outer(one, other) % size)
     return np.concatenate([np.cos(angle), np.sin(angle)], axis)
 
 
-def pair_shifts(
+def measure_shifts(
     images: Images,
     size: tuple[int, int],
     pairs: tuple[Indices, Indices],
@@ -84,9 +84,9 @@ def pair_shifts(
     reach: int,
     samples: int,
 ) -> Floats:
-    """Shifts of pairs of images within `reach`, (pairs, 2): down, right, px; see `phase_only_correlation`.
+    """Measure the shifts of pairs of images within `reach`, (pairs, 2): down, right, px.
 
-    To so many `samples` on each side of a peak, the Dirichlet kernel is fitted.
+    See `phase_only_correlation`; the Dirichlet kernel is fitted to so many `samples` on each side of a peak.
     """
     down, right = (min(reach, n // 2 - 1) + samples for n in size)
     ways = range(-down, down + 1), range(-right, right + 1)
@@ -102,7 +102,7 @@ def full_band(height: int, width: int) -> tuple[int, int]:
 
 
 def blob_size(cuts: Images) -> tuple[float, float]:
-    """Height and width of the box with the mean distance from its middle that cuts have, px.
+    """Height and width of a box with the cuts' mean distance from its middle, px.
 
     A box of h pixels has a mean distance of h / 4, which a stray pixel moves less than it moves a variance.
     """
@@ -116,7 +116,7 @@ def blob_size(cuts: Images) -> tuple[float, float]:
 def blob_band(cuts: Images, size: tuple[int, int]) -> tuple[int, int]:
     """Highest harmonics, of `size`, that blobs in the middles of cuts fill down and across; not 0."""
     down, across = (
-        min(max(round(_CYCLES * n / max(blob, 1.0)), 1), most)
+        min(max(round(_BAND_CYCLES * n / max(blob, 1.0)), 1), most)
         for n, blob, most in zip(size, blob_size(cuts), full_band(*size), strict=True)
     )
     return down, across

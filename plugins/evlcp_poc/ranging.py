@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_poc import _kernels
-from evlcp_poc.correlation import blob_band, full_band, pair_shifts
+from evlcp_poc.correlation import blob_band, full_band, measure_shifts
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
@@ -18,10 +18,10 @@ from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, Range, to_kernel_array
 
-_NONE = Range(float("nan"), float("nan"), 0)
+_NO_RANGE = Range(float("nan"), float("nan"), 0)
 
 _RIM_PX = 0.2
-"""How far off the shift of two clusters of a panel is in all frames alike: the halo around it has fewer rows
+"""Error that the shift of two clusters of a panel has in all frames alike: the halo around it has fewer rows
 and columns of clusters between it and them than in a long bar."""
 
 
@@ -95,18 +95,18 @@ class PocRanging(Ranging):
         Raises:
             ConfigError: Fewer than two clusters are left to pair, or clusters are not alike.
         """
-        used = self._used(bar.clusters)
+        selected = self._select_clusters(bar.clusters)
         if not self.clusters:
             # Which are outermost follows from what is seen.
-            used = np.arange(bar.clusters)
+            selected = np.arange(bar.clusters)
         all_count = bool(self.clusters) or self.skip_outer == 0
-        skip = self._skip(bar.clusters) if bar.is_even_line and not all_count else 0
+        skip = self._skipped_at_ends(bar.clusters) if bar.is_even_line and not all_count else 0
         centres = bar.cluster_centres_m()
-        a, b = np.triu_indices(len(used), 1)
+        a, b = np.triu_indices(len(selected), 1)
         if not all_count:
-            same = bar.lit_sides[used[a]] == bar.lit_sides[used[b]]
+            same = bar.lit_sides[selected[a]] == bar.lit_sides[selected[b]]
             a, b = a[same], b[same]
-        a, b = used[a], used[b]
+        a, b = selected[a], selected[b]
         apart = np.hypot(*(centres[:, None] - centres).T)
         instead = f"use '{ROLES['ranging'].default_for(bar, codebook.unpaired_codes)}' for this layout"
         if not (bar.has_equal_clusters and bar.has_distinct_centres):
@@ -124,22 +124,22 @@ class PocRanging(Ranging):
         rules = self.weight_power, self.drop_extremes, self.outlier_iqr
 
         @lru_cache(maxsize=256)
-        def known_pairs(lit: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-            """Pairs far apart of clusters that are seen, and their spacing: of most frames, the same are."""
-            seen = used[np.frombuffer(lit, np.bool_)[used]]
+        def select_pairs(lit: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+            """Pairs of seen clusters that are far apart, and their spacing: the same in most frames."""
+            seen = selected[np.frombuffer(lit, np.bool_)[selected]]
             inner = seen[skip : max(len(seen) - skip, 0)]
             both = np.isin(a, inner) & np.isin(b, inner)
             far = both & (apart[a, b] >= self.min_spacing * (apart[a, b] * both).max() - 1e-12)
             return a[far], b[far], apart[a, b][far]
 
-        least = min(self.min_pairs, max(len(known_pairs(b"\1" * bar.clusters)[0]), 1))
+        least = min(self.min_pairs, max(len(select_pairs(b"\1" * bar.clusters)[0]), 1))
 
         def measure(view: FrameView) -> Range:
             maps, middles = to_kernel_array(view.presence.pixels), np.empty((bar.clusters, 2), np.int64)
             px_per_m, *lit_px = _kernels.find_middles(maps, apart, self.min_pixels, middles)
-            far = known_pairs((middles[:, 0] >= 0).tobytes())
+            far = select_pairs((middles[:, 0] >= 0).tobytes())
             if len(far[0]) < least or px_per_m <= 0:
-                return _NONE
+                return _NO_RANGE
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
             neighbour_px = px_per_m * neighbour
             height = cut_size(2 * neighbour_px + 8)
@@ -150,7 +150,7 @@ class PocRanging(Ranging):
             most = full_band(*size) if self.band == "full" else blob_band(cuts, size)
             # Two medians of blobs of one spacing are wrong by half a spacing at the most.
             reach = max(int(neighbour_px / 2), 2)
-            beyond_px = pair_shifts(cuts, size, far[:2], most, reach, self.peak_samples)
+            beyond_px = measure_shifts(cuts, size, far[:2], most, reach, self.peak_samples)
             places = px_per_m, neighbour, least
             mean, sigma, kept = _kernels.mean_distance(
                 middles, beyond_px, far, camera.focal_px, places, rules
@@ -160,29 +160,34 @@ class PocRanging(Ranging):
 
         return measure
 
-    def _skip(self, clusters: int) -> int:
-        """How many are left out at each end: of three or fewer, none could be."""
+    def _skipped_at_ends(self, clusters: int) -> int:
+        """Clusters left out at each end: of three or fewer, none could be."""
         return self.skip_outer if clusters > 3 else 0
 
-    def _used(self, clusters: int) -> NDArray[np.int64]:
-        skip = self._skip(clusters)
-        used = np.array(self.clusters or range(skip, clusters - skip), np.int64)
+    def _select_clusters(self, clusters: int) -> NDArray[np.int64]:
+        skip = self._skipped_at_ends(clusters)
+        selected = np.array(self.clusters or range(skip, clusters - skip), np.int64)
         if clusters < 2:
             raise ConfigError(
                 "ranging 'poc' needs two clusters; no ranging measures the distance of one: use 'none' for"
                 " this layout"
             )
-        if not self.clusters and len(used) < 2:
+        if not self.clusters and len(selected) < 2:
             raise ConfigError(
-                f"ranging.skip_outer = {self.skip_outer}: leaves {len(used)} of {clusters} clusters,"
+                f"ranging.skip_outer = {self.skip_outer}: leaves {len(selected)} of {clusters} clusters,"
                 f" expected two or more; set ranging.skip_outer = {(clusters - 2) // 2}"
             )
-        if len(used) < 2 or used.min() < 0 or used.max() >= clusters or len(set(used)) != len(used):
+        if (
+            len(selected) < 2
+            or selected.min() < 0
+            or selected.max() >= clusters
+            or len(set(selected)) != len(selected)
+        ):
             raise ConfigError(
                 f"ranging.clusters = {list(self.clusters)}:"
                 f" expected two or more different clusters of 0 to {clusters - 1}"
             )
-        return np.sort(used)
+        return np.sort(selected)
 
 
 def cut_size(least: float) -> int:

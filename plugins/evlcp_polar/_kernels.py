@@ -14,12 +14,12 @@ FROZEN, REPEATED, FREE = 0, 1, 2
 
 
 @njit
-def _fork(metric: Array, penalty: Array, limit: float, alive: Array, rows: Array, fork: Array) -> int:
-    """Continue each path by bit 0 and bit 1, keep the best that have room; their number.
+def _fork_paths(metric: Array, penalty: Array, limit: float, alive: Array, rows: Array, fork: Array) -> int:
+    """Continue each path by bit 0 and bit 1, and keep the best that have room; return how many.
 
     `penalty` (2, size) is what the bits add to the metric. Where both continuations of a path stay, that by 1
-    gets a free row, and shares `rows`; `fork` (2, size) says of which path each row is the continuation, and
-    by which bit.
+    gets a free row, and shares `rows`; `fork` (2, size) takes which path each row continues, and by which
+    bit.
     """
     size, origin, bit = len(metric), fork[0], fork[1]
     cost, which = np.empty(2 * size), np.empty(2 * size, np.int64)
@@ -66,7 +66,7 @@ def _fork(metric: Array, penalty: Array, limit: float, alive: Array, rows: Array
 
 
 @njit
-def _decide(
+def _decide_node(
     stage: int,
     repeated: bool,
     alpha: Array,
@@ -78,10 +78,10 @@ def _decide(
     fork: Array,
     codewords: Array,
 ) -> int:
-    """Decide a node in the first code bits of each path; the paths kept.
+    """Decide a node in the first code bits of each path; return the number of paths kept.
 
-    Where its inputs are all 0 but the last (`repeated`), its code bits are all the same. Else they are all
-    free: of `size` paths none goes against more than the `size - 1` weakest signs.
+    If its inputs are all 0 but the last (`repeated`), its code bits are all the same. Else they are all free:
+    of `size` paths none goes against more than the `size - 1` weakest signs.
     """
     size, length = len(metric), 1 << stage
     splits = 0 if repeated else min(size - 1, length)
@@ -107,7 +107,7 @@ def _decide(
             found[at] = i
             many = min(many + 1, splits)
     if repeated:
-        count = _fork(metric, penalty, limit, alive, rows, fork)
+        count = _fork_paths(metric, penalty, limit, alive, rows, fork)
         for path in range(size):
             if alive[path]:
                 for i in range(length):
@@ -117,7 +117,7 @@ def _decide(
             if alive[path]:
                 penalty[0, path] = 0.0
                 penalty[1, path] = abs(alpha[rows[0, path, stage], length + weakest[path, split]])
-        count = _fork(metric, penalty, limit, alive, rows, fork)
+        count = _fork_paths(metric, penalty, limit, alive, rows, fork)
         for path in range(size):
             other = fork[0, path]
             if alive[path] and other != path:
@@ -133,7 +133,7 @@ def _decide(
 
 @njit
 def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Array, metric: Array) -> int:
-    """Successive-cancellation list decoding; the paths kept, none if all exceed the limit.
+    """Successive-cancellation list decoding; returns the number of paths, 0 if all exceed the limit.
 
     Tal and Vardy (2015), by LLRs and min-sum (Balatsoukas-Stimming et al. 2015): the metric of a whole path
     is the total of |llr| where its codeword differs from the sign of the LLR, and only grows along the path.
@@ -145,8 +145,8 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
         nodes: (First input, stage, kind) of each, int64 (nodes, 3).
         size: Most paths; 1 is successive cancellation.
         limit: A path whose metric exceeds it is dropped.
-        codewords: Filled with each path's code bits, uint8 (size, N).
-        metric: Filled with each path's metric, float64 (size,).
+        codewords: Takes each path's code bits, uint8 (size, N).
+        metric: Takes each path's metric, float64 (size,).
     """
     n, stages = len(llr), 0
     while 1 << stages < n:
@@ -187,7 +187,7 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
         count = 0
         if kind != FROZEN:
             repeated = kind == REPEATED
-            count = _decide(stage, repeated, alpha, rows, limit, metric, alive, penalty, fork, codewords)
+            count = _decide_node(stage, repeated, alpha, rows, limit, metric, alive, penalty, fork, codewords)
         else:
             for path in range(size):
                 if alive[path]:

@@ -15,8 +15,8 @@ from evlcp_sdk.air.crc import CRC_BITS, crc24
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Code, Corrected, ErrorCorrection
 
-_MOST_BITS = 1024
-"""Longest codeword: what the reliability sequence is given for."""
+_MAX_BITS = 1024
+"""Longest codeword: the reliability sequence is given for this length."""
 
 _PIECES = (
     *(0, 1, 2, 4, 3, 5, 6, 7, 8, 16, 9, 17, 10, 18, 11, 19),
@@ -71,7 +71,7 @@ class Polar(ErrorCorrection):
             ConfigError: A codeword has no room for a byte beside the CRC, or for what a plausible one has
                 beyond its message.
         """
-        words = max(-(-coded_bits // _MOST_BITS), 1)
+        words = max(-(-coded_bits // _MAX_BITS), 1)
         length = coded_bits // words
         # A rate such as 0.35 has no exact double: the little more keeps 0.35 * 320 from being 111.99.
         message_bits = (int(self.rate * length + 1e-6) - CRC_BITS) // 8 * 8
@@ -102,29 +102,29 @@ class Polar(ErrorCorrection):
             words=words,
             length=length,
             information=information,
-            sent=sent_bits(length, message_bits + CRC_BITS),
-            punctured=_punctured(length, message_bits + CRC_BITS),
+            sent=transmission_order(length, message_bits + CRC_BITS),
+            punctured=_is_punctured(length, message_bits + CRC_BITS),
             list_sizes=tuple(dict.fromkeys(sizes)),
             log_share=log_share,
         )
 
 
-def _mother_bits(length: int) -> int:
+def _mother_length(length: int) -> int:
     return max(1 << (length - 1).bit_length(), len(_PIECES))
 
 
-def _punctured(length: int, information_bits: int) -> bool:
-    return length < _mother_bits(length) and information_bits / length <= _PUNCTURED_UP_TO
+def _is_punctured(length: int, information_bits: int) -> bool:
+    return length < _mother_length(length) and information_bits / length <= _PUNCTURED_UP_TO
 
 
-def sent_bits(length: int, information_bits: int) -> NDArray[np.int64]:
-    """Code bits of the mother code in the order in which they are sent, int64 (length,).
+def transmission_order(length: int, information_bits: int) -> NDArray[np.int64]:
+    """Order in which code bits of the mother code are sent, int64 (length,).
 
     The mother code has the next power of two of bits; 3GPP TS 38.212, 5.4.1.1 and 5.4.1.2.
     """
-    n = _mother_bits(length)
+    n = _mother_length(length)
     order = np.arange(n).reshape(len(_PIECES), -1)[list(_PIECES)].ravel()
-    return order[n - length :] if _punctured(length, information_bits) else order[:length]
+    return order[n - length :] if _is_punctured(length, information_bits) else order[:length]
 
 
 def information_set(length: int, information_bits: int) -> NDArray[np.bool_]:
@@ -133,12 +133,12 @@ def information_set(length: int, information_bits: int) -> NDArray[np.bool_]:
     Shortened and punctured code bits are not information bits, nor are the first inputs of a punctured code;
     of the others the most reliable are chosen.
     """
-    n = _mother_bits(length)
+    n = _mother_length(length)
     order = np.array(RELIABILITY)
     order = order[order < n]
     barred = np.ones(n, bool)
-    barred[sent_bits(length, information_bits)] = False
-    if _punctured(length, information_bits):
+    barred[transmission_order(length, information_bits)] = False
+    if _is_punctured(length, information_bits):
         early = 3 * n / 4 - length / 2 if 4 * length >= 3 * n else 9 * n / 16 - length / 4
         barred[: ceil(early)] = True
     information = np.zeros(n, bool)
@@ -149,9 +149,9 @@ def information_set(length: int, information_bits: int) -> NDArray[np.bool_]:
 def discrepancy_limit(weight: NDArray[np.float64], log_share: float) -> float:
     """Largest total of flipped weights that is not an accident; negative if any total may be one.
 
-    A word of random signs lies within D of a given codeword with a probability of at most
-    exp(z D) prod((1 + exp(-z w)) / 2) for every z > 0 (Chernoff). The D is found at which the least of these
-    is exp(`log_share`), or a little less. The bound falls with z, and D is the mean of the tilted weights.
+    A word of random signs is within D of a given codeword with a probability of at most exp(z D) prod((1 +
+    exp(-z w)) / 2) for every z > 0 (Chernoff). The D is found at which the least of these is
+    exp(`log_share`), or a little less. The bound falls with z, and D is the mean of the tilted weights.
     """
     weight = weight[weight > 0]
     none = len(weight) * log(2)
@@ -188,9 +188,9 @@ def transform(bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def list_nodes(information: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """The largest nodes that are decided at once, (first input, stage, kind) of each, int64 (nodes, 3).
+    """List the largest nodes that are decided at once, (first input, stage, kind) of each, int64 (nodes, 3).
 
-    `information` says which inputs carry some, bool (N,).
+    `information` marks the inputs that carry information, bool (N,).
     """
     inside = np.concatenate([[0], np.cumsum(information)]).tolist()
     nodes, first = [], 0
@@ -214,8 +214,8 @@ def list_nodes(information: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 @lru_cache(maxsize=16)
-def _known_nodes(information: bytes) -> NDArray[np.int64]:
-    """As `list_nodes`: they take a millisecond, and a link is compiled again and again."""
+def _cached_nodes(information: bytes) -> NDArray[np.int64]:
+    """As `list_nodes`, which takes a millisecond, while a link is compiled again and again."""
     return list_nodes(np.frombuffer(information, np.bool_))
 
 
@@ -236,7 +236,7 @@ class _PolarCode:
     @cached_property
     def nodes(self) -> NDArray[np.int64]:
         """The order of decoding; found with the first block."""
-        return _known_nodes(self.information.tobytes())
+        return _cached_nodes(self.information.tobytes())
 
     def encode(self, bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if bits.shape != (self.message_bits,):
@@ -266,7 +266,7 @@ class _PolarCode:
         return Corrected(np.concatenate(message), ok, flipped)
 
     def _decode_word(self, llr: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.uint8], bool]:
-        """The likeliest codeword that was found, its inputs, and whether it passes."""
+        """The likeliest codeword found, its inputs, and whether it passes."""
         weight = np.abs(llr)
         mean = weight.mean()
         if mean > 0:

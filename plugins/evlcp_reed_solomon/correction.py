@@ -12,9 +12,9 @@ from evlcp_sdk.air.crc import CRC_BITS, crc24
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Code, Corrected, ErrorCorrection
 
-_LONGEST = 255
+_MAX_BYTES = 255
 _CRC_BYTES = CRC_BITS // 8
-_SPARE = 8
+_MIN_PARITY = 8
 """Parity bytes of a codeword that are left to correct errors.
 
 With them a codeword of random bytes decodes with a probability of 1 / 4! at most (four errors are corrected),
@@ -42,16 +42,16 @@ class ReedSolomon(ErrorCorrection):
         from reedsolo import RSCodec
 
         size = coded_bits // 8
-        words = max(ceil(size / _LONGEST), 1)
+        words = max(ceil(size / _MAX_BYTES), 1)
         # The little less keeps (1 - 0.9) * 120 from being 12.000001.
         parity = ceil((1 - self.rate) * size / words - 1e-6)
         data = size - words * parity
-        if data <= _CRC_BYTES or parity < _SPARE:
+        if data <= _CRC_BYTES or parity < _MIN_PARITY:
             raise ConfigError(
                 f"error-correction 'reed-solomon': a block of {coded_bits} bits at rate {self.rate:g}:"
-                f" expected {_CRC_BYTES + 1} bytes of message and CRC and {_SPARE} of parity a codeword"
+                f" expected {_CRC_BYTES + 1} bytes of message and CRC and {_MIN_PARITY} of parity a codeword"
             )
-        codec = RSCodec(nsym=parity, nsize=_LONGEST, fcr=0, prim=0x11D, generator=2, c_exp=8)
+        codec = RSCodec(nsym=parity, nsize=_MAX_BYTES, fcr=0, prim=0x11D, generator=2, c_exp=8)
         return _ReedSolomonCode(8 * (data - _CRC_BYTES), coded_bits, words, data, parity, codec)
 
 
@@ -70,8 +70,8 @@ class _ReedSolomonCode:
         sent = np.zeros(self.data + self.words * self.parity, np.uint8)
         sent[: self.data] = np.packbits(np.concatenate([bits, crc24(bits)]))
         for word in range(self.words):
-            whole = self.codec.encode(sent[word : self.data : self.words].tobytes())
-            sent[self.data + word :: self.words] = np.frombuffer(whole, np.uint8)[-self.parity :]
+            codeword = self.codec.encode(sent[word : self.data : self.words].tobytes())
+            sent[self.data + word :: self.words] = np.frombuffer(codeword, np.uint8)[-self.parity :]
         coded = np.zeros(self.coded_bits, np.uint8)
         coded[: 8 * len(sent)] = np.unpackbits(sent)
         return coded
@@ -85,9 +85,9 @@ class _ReedSolomonCode:
         signs = llr[: 8 * size] < 0
         received = np.packbits(signs)
         weakest = np.abs(llr[: 8 * size]).reshape(size, 8).min(1)
-        most = self.parity - _SPARE
+        most = self.parity - _MIN_PARITY
         for erased in sorted({0, min(self.parity // 2, most), most}):
-            data = self._corrected(received, weakest, erased)
+            data = self._correct_words(received, weakest, erased)
             if data is None:
                 continue
             bits = np.unpackbits(data)
@@ -97,7 +97,7 @@ class _ReedSolomonCode:
                 return Corrected(message, True, int(wrong[llr[: 8 * size] != 0].sum()))
         return Corrected(signs[: self.message_bits].astype(np.uint8), False, 0)
 
-    def _corrected(
+    def _correct_words(
         self, received: NDArray[np.uint8], weakest: NDArray[np.float32], erased: int
     ) -> NDArray[np.uint8] | None:
         """Message and CRC bytes with the least reliable of each codeword erased; None if one fails."""
@@ -108,11 +108,11 @@ class _ReedSolomonCode:
             message = np.arange(word, self.data, self.words)
             at = np.concatenate([message, np.arange(self.data + word, len(received), self.words)])
             count = max(erased, int((weakest[at] == 0).sum()))
-            if count > self.parity - _SPARE:
+            if count > self.parity - _MIN_PARITY:
                 return None
-            gone = np.argsort(weakest[at], kind="stable")[:count]
+            erasures = np.argsort(weakest[at], kind="stable")[:count]
             try:
-                data = self.codec.decode(received[at].tobytes(), erase_pos=gone.tolist())[0]
+                data = self.codec.decode(received[at].tobytes(), erase_pos=erasures.tolist())[0]
             except ReedSolomonError:
                 return None
             found[word :: self.words] = np.frombuffer(data, np.uint8)

@@ -11,8 +11,8 @@ Array = NDArray[Any]
 
 
 @njit
-def _values(first: Array, second: Array, out: Array) -> None:
-    """Values of pairs of polarity sums, `out` int8 (n,): the second's sign, else less the first's.
+def _pair_values(first: Array, second: Array, out: Array) -> None:
+    """Values of pairs of polarity sums, `out` int8 (n,): the second's sign, else the opposite of the first's.
 
     Long loops over flat arrays run on many pixels at once; those over a bar's few columns do not.
     """
@@ -24,8 +24,8 @@ def _values(first: Array, second: Array, out: Array) -> None:
 
 
 @njit
-def _fit(code: Array, values: Array, begin: int, out: Array) -> None:
-    """How far values (n, many), from `begin` on, agree with a code (n,), `out` int16: alike less unlike."""
+def _correlate_code(code: Array, values: Array, begin: int, out: Array) -> None:
+    """Agreement of values (n, pixels), from `begin` on, with a code (n,), `out` int16: alike less unlike."""
     for j in range(out.size):
         out[j] = 0
     for i in range(code.size):
@@ -39,14 +39,14 @@ def _fit(code: Array, values: Array, begin: int, out: Array) -> None:
 
 
 @njit
-def presence(
-    sums: Array, codes: Array, grid: int, beside: Array, none: Array, min_seen: int, out: Array
+def estimate_presence(
+    sums: Array, codes: Array, grid: int, ratios: Array, none_ratios: Array, min_seen: int, out: Array
 ) -> None:
-    """Posterior probability of each cluster in each cell, `out` (K, rows, columns), of its values.
+    """Posterior probability of each cluster in each cell, `out` (K, rows, columns), by the cell's values.
 
-    These are of the cells' polarity sums, of `sums` (chips, height, width). A cluster whose fit is d below
-    the best is `beside[d]` times as likely as that, and `no cluster` `none[seen, best + n]` times. Cells in
-    which fewer than `min_seen` of n values are seen are left as they are.
+    Values are those of the cells' polarity sums, of `sums` (chips, height, width). A cluster whose fit is d
+    below the best is `ratios[d]` times as likely as that, and no cluster `none_ratios[seen, best + n]` times.
+    Cells with fewer than `min_seen` of n values are left as they are.
     """
     clusters, length = codes.shape
     _, height, width = sums.shape
@@ -72,7 +72,7 @@ def presence(
                     for j in range(most):
                         total[j] = np.int16(total[j] + other[j])
                 part = total
-        _values(square[1, 0], square[1, 1], by_pixel)
+        _pair_values(square[1, 0], square[1, 1], by_pixel)
         for r in range(rows):
             for c in range(columns):
                 j = r * columns + c
@@ -92,27 +92,27 @@ def presence(
     for j in range(m):
         best[j] = -length
     for k in range(clusters):
-        _fit(codes[k], some, begin, fits[k])
+        _correlate_code(codes[k], some, begin, fits[k])
         for j in range(m):
             best[j] = max(best[j], fits[k, j])
     norm = np.empty(m)
     for j in range(m):
-        norm[j] = none[seen[which[j]], best[j] + length]
+        norm[j] = none_ratios[seen[which[j]], best[j] + length]
     for k in range(clusters):
         for j in range(m):
-            norm[j] += beside[np.uint32(best[j] - fits[k, j])]
+            norm[j] += ratios[np.uint32(best[j] - fits[k, j])]
     for k in range(clusters):
         for j in range(m):
-            into[k, which[j]] = beside[np.uint32(best[j] - fits[k, j])] / norm[j]
+            into[k, which[j]] = ratios[np.uint32(best[j] - fits[k, j])] / norm[j]
 
 
 @njit
-def pixel_maps(
+def map_pixels(
     sums: Array, codes: Array, grid: int, probability: Array, least: float, selected: Array, out: Array
 ) -> None:
-    """Pilot correlation of the pixels in each cluster's selected cells and their neighbours, 0 to 1.
+    """Correlate pixels in each cluster's selected cells and their neighbours with its pilot, `out` 0 to 1.
 
-    `selected` (K, rows, columns) takes which cells are at `least` so likely.
+    `selected` (K, rows, columns) takes which cells have a probability of `least` or more.
     """
     clusters, length = codes.shape
     _, rows, columns = selected.shape
@@ -120,7 +120,7 @@ def pixel_maps(
     flat = sums.reshape(-1, height * width)
     values, fit = np.empty((length, height * width), np.int8), np.empty(height * width, np.int16)
     for i in range(length):
-        _values(flat[2 * i], flat[2 * i + 1], values[i])
+        _pair_values(flat[2 * i], flat[2 * i + 1], values[i])
     near = np.empty((rows, columns), np.bool_)
     for k in range(clusters):
         top, bottom = rows, 0
@@ -134,7 +134,7 @@ def pixel_maps(
         if top >= bottom:
             continue
         begin, end = top * grid * width, bottom * grid * width
-        _fit(codes[k], values, begin, fit[: end - begin])
+        _correlate_code(codes[k], values, begin, fit[: end - begin])
         near[top:bottom] = False
         for r in range(top, bottom):
             for c in range(columns):
@@ -151,10 +151,10 @@ def pixel_maps(
 
 
 @njit
-def weighted_values(sums: Array, probability: Array, grid: int, least: float, out: Array) -> None:
-    """Presence-weighted sum of the values of the info chips, `out` (K, values).
+def sum_values(sums: Array, probability: Array, grid: int, least: float, out: Array) -> None:
+    """Sum the values of the info chips, weighted by presence, `out` (K, values).
 
-    What is less than `least` likely is passed over.
+    Cells less likely than `least` are left out.
     """
     clusters, rows, columns = probability.shape
     length = out.shape[1]
@@ -167,7 +167,7 @@ def weighted_values(sums: Array, probability: Array, grid: int, least: float, ou
         for j in range(cells.size):
             top[j] = max(top[j], cells[j])
     for i in range(length):
-        _values(flat[2 * i], flat[2 * i + 1], by_pixel[i])
+        _pair_values(flat[2 * i], flat[2 * i + 1], by_pixel[i])
     for r in range(rows):
         for c in range(columns):
             if top[r * columns + c] < least:
@@ -188,9 +188,9 @@ def weighted_values(sums: Array, probability: Array, grid: int, least: float, ou
 def match_words(
     values: Array, by_value: Array, symbols: Array, best: Array, llr: Array
 ) -> tuple[float, float]:
-    """The word that correlates most with each cluster's values (K, n), and its correlation, `best` (K,).
+    """Match each cluster's values (K, n) with the words: number of the best and its correlation, `best` (K,).
 
-    `by_value` are the words (n, words), of which the 2^bits first carry bits: `llr` (K, bits) gets the best
+    `by_value` are the words (n, words), of which the 2^bits first carry bits: `llr` (K, bits) takes the best
     correlation of the words with each bit 0, less that with 1.
 
     Returns:
@@ -228,7 +228,7 @@ def match_words(
 
 
 @njit
-def learn_worth(
+def learn_pair_llr(
     sums: Array,
     most: int,
     signs: Array,
@@ -238,16 +238,16 @@ def learn_worth(
     pairs: Array,
     out: Array,
 ) -> None:
-    """Log ratio of how often each pair of sums comes with a value of +1 and with -1, `out` (pairs,).
+    """Learn the log ratio of how often each pair of sums comes with values of +1 and -1, `out` (pairs,).
 
-    A pixel that rather shows one cluster than any other, or none, counts for it by its probability. To each
-    pair `prior` is added, on average of the two values: to each as it has counts, so that what comes with
-    both alike is worth 0. A pilot of one value throughout, as that of a lone cluster, says nothing of the
-    other: what comes with it is taken to be the same with all signs changed.
+    A pixel that more likely shows one cluster than any other, or none, counts for it by its probability. To
+    each pair `prior` is added, on average of the two values, in proportion to their counts, so that a pair
+    that comes with both alike has a ratio of 0. A pilot of one value throughout, as that of a lone cluster,
+    does not show the other: that is taken to be the same with all signs changed.
 
     Args:
         sums: Polarity sums, int16 (chips, height, width).
-        most: They are clipped to -most to most; 7 at the most.
+        most: They are clipped to -most to most; 7 at most.
         signs: Whether the pilots' values are +1, uint64 (K, values).
         probability: Of each cluster in each cell, (K, rows, columns).
         grid: Side of a cell.
@@ -265,7 +265,7 @@ def learn_worth(
             a = np.int16(min(max(flat[2 * i, j], low), high) - low)
             b = np.int16(min(max(flat[2 * i + 1, j], low), high) - low)
             pairs[i, j] = np.uint8(np.int16(a * side) + b)
-    counts, total, more = np.zeros((2, out.size)), np.zeros(2), np.empty(2)
+    counts, total, added = np.zeros((2, out.size)), np.zeros(2), np.empty(2)
     for k in range(clusters):
         for r in range(rows):
             # Most rows of a bar show another cluster.
@@ -289,36 +289,36 @@ def learn_worth(
                 counts[value, pair] = counts[1 - value, out.size - 1 - pair]
             total[value] = total[1 - value]
     for value in range(2):
-        more[value] = prior * 2 * total[value] / (total[0] + total[1]) if total[0] > 0 else prior
-    first, second = total[0] + more[0] * out.size, total[1] + more[1] * out.size
+        added[value] = prior * 2 * total[value] / (total[0] + total[1]) if total[0] > 0 else prior
+    first, second = total[0] + added[0] * out.size, total[1] + added[1] * out.size
     for pair in range(out.size):
-        out[pair] = np.log((counts[1, pair] + more[1]) / second * first / (counts[0, pair] + more[0]))
+        out[pair] = np.log((counts[1, pair] + added[1]) / second * first / (counts[0, pair] + added[0]))
 
 
 @njit
-def sum_worth(
+def sum_pair_llr(
     pairs: Array,
     width: int,
     signs: Array,
     probability: Array,
     grid: int,
-    worth: Array,
+    pair_llr: Array,
     limits: tuple[float, float],
     out: Array,
 ) -> None:
-    """Presence-weighted sum of what each pixel's pair of sums is worth in the values after the pilots.
+    """Sum the log ratios of each pixel's pairs of sums in the values after the pilots, weighted by presence.
 
-    As in `learn_worth`; `out` is (K, values). A pixel counts by how likely its pilot makes it that it shows
-    the cluster, not what comes with both values alike. `limits` are the probability of cells below which they
-    are passed over, and the odds against a pixel before that.
+    As in `learn_pair_llr`; `out` is (K, values). A pixel is weighted by how likely its pilot makes it that it
+    shows the cluster, rather than what comes with both values alike. `limits` are the least probability of
+    cells, and the odds against a pixel before its pilot.
     """
     least, odds = limits
     clusters, rows, columns = probability.shape
     length, known = out.shape[1], signs.shape[1]
     # Mean of a pair's likelihoods with a value of -1 and with +1, over that with -1, or with +1.
-    unlike = np.empty((2, worth.size))
-    for pair in range(worth.size):
-        ratio = np.exp(min(max(worth[pair], -50.0), 50.0))
+    unlike = np.empty((2, pair_llr.size))
+    for pair in range(pair_llr.size):
+        ratio = np.exp(min(max(pair_llr[pair], -50.0), 50.0))
         unlike[0, pair], unlike[1, pair] = (1 + ratio) / 2, (1 + 1 / ratio) / 2
     top = np.zeros(rows * columns, probability.dtype)
     for k in range(clusters):
@@ -339,7 +339,7 @@ def sum_worth(
                 for u in range(c * grid, (c + 1) * grid):
                     at = v * width + u
                     for i in range(length):
-                        values[i] = worth[pairs[known + i, at]]
+                        values[i] = pair_llr[pairs[known + i, at]]
                     for j in range(n):
                         k, against = which[j], odds
                         for i in range(known):
@@ -351,22 +351,22 @@ def sum_worth(
 
 @njit
 def match_shifts(
-    pairs: Array, worth: Array, share: float, maps: Array, prior: Array, grid: int, out: Array
+    pairs: Array, pair_llr: Array, share: float, maps: Array, prior: Array, grid: int, out: Array
 ) -> None:
-    """Add what the pixels of each cluster say of each value if the bar is off its place, (K, n, n, values).
+    """Add the evidence of each cluster's pixels for values if the bar is off its place, (K, n, n, values).
 
-    Shifts (down, right) go from -(n // 2) to n // 2 px. `pairs` and `worth` are those of `learn_worth`; of
-    what is said, beyond what a pixel without events says, so large a share counts. Pixels count where a
-    cluster may be, by the prior of their cell: those of its neighbours tell nothing.
+    Shifts (down, right) go from -(n // 2) to n // 2 px. `pairs` and `pair_llr` are those of `learn_pair_llr`;
+    a `share` of each counts, beyond that of a pixel without events. Pixels count where a cluster may be, by
+    the prior of their cell: those of its neighbours are no evidence.
     """
     clusters, rows, columns = prior.shape
     _, height, width = maps.shape
     _, side, _, values = out.shape
     seam = side // 2
-    beside, part = worth.astype(np.float32), np.float32(share)
-    silent = beside[worth.size // 2]
-    for pair in range(worth.size):
-        beside[pair] = (beside[pair] - silent) * part
+    evidence, part = pair_llr.astype(np.float32), np.float32(share)
+    silent = evidence[pair_llr.size // 2]
+    for pair in range(pair_llr.size):
+        evidence[pair] = (evidence[pair] - silent) * part
     # Values lie side by side, and so do those of neighbouring pixels.
     run = side * values
     lines = np.zeros((height + 2 * seam, (width + 2 * seam) * values), np.float32)
@@ -374,7 +374,7 @@ def match_shifts(
         line = lines[seam + v, seam * values :]
         for u in range(width):
             for i in range(values):
-                line[u * values + i] = beside[pairs[i, v * width + u]]
+                line[u * values + i] = evidence[pairs[i, v * width + u]]
     sums = out.reshape(clusters, side, run)
     for k in range(clusters):
         for r in range(rows):
@@ -394,12 +394,12 @@ def match_shifts(
 
 @njit
 def find_path(matches: Array, known: Array, step_cost: float, place_cost: float, path: Array) -> None:
-    """Shifts (down, right) of all values that match best together (Viterbi), `path` (values, 2), px.
+    """Find the shifts (down, right) of all values that match best together (Viterbi), `path` (values, 2), px.
 
     `matches` are (K, n, n, values), `known` the codes of the first values, (K, ...); of the others, each
-    cluster's is what fits better. A shift costs its square times `place_cost`, a change from value to value
-    its square times `step_cost`. Squares add, so the best predecessor is sought along one axis, then along
-    the other.
+    cluster's is the one that fits better. A shift costs its square times `place_cost`, a change from value to
+    value its square times `step_cost`. Squares add, so the best predecessor is sought along one axis, then
+    along the other.
     """
     clusters, side, _, values = matches.shape
     first, half = known.shape[1], side // 2

@@ -1,4 +1,4 @@
-"""What the info segment of each cluster says."""
+"""Decoding of the info segment of each cluster: correlation with codewords, and likelihoods."""
 
 from dataclasses import dataclass
 
@@ -10,21 +10,21 @@ from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols, to_kernel_array
 from evlcp_wh import _kernels
 
-_MIN_WEIGHT, _MIN_LEARNT_WEIGHT = 0.01, 0.05
-"""Presence probability below which a cell is passed over by `wh-transform`, and by others: it adds nothing
-that is seen, but takes time."""
+_MIN_WEIGHT, _MIN_SOFT_WEIGHT = 0.01, 0.05
+"""Presence probability below which a cell is left out by `wh-transform`, and by the others: it adds nothing
+but time."""
 
 MAX_EVENTS = 3
 """Polarity sums beyond this many events count as this many: more are too rare to learn."""
 
 _PRIOR_COUNT = 1.0
-"""Observations added to every pair of sums: what was seen once or twice by chance is worth little."""
+"""Observations added to every pair of sums: those seen once or twice by chance mean little."""
 
 INDEPENDENT_PIXELS = 0.25
 """Share of the pixels that err by themselves; neighbours share light and motion."""
 
 _PIXEL_SHARE = 0.05
-"""Share of the pixels in a cluster's place that show it, before their pilots speak: a bar is narrow."""
+"""Prior share of the pixels in a cluster's place that show it, before their pilots: a bar is narrow."""
 
 
 def match_words(
@@ -68,7 +68,7 @@ class WhTransform(Decoding):
             probability = to_kernel_array(presence.probability)
             values = np.zeros((len(probability), length))
             info = to_kernel_array(sums[pilot_chips:])
-            _kernels.weighted_values(info, probability, presence.grid_px, _MIN_WEIGHT, values)
+            _kernels.sum_values(info, probability, presence.grid_px, _MIN_WEIGHT, values)
             symbols, best, margins, _, _ = match_words(values, by_value, codebook.bits_per_symbol)
             energy, explained = float(np.vdot(values, values)), float(best @ best) / length
             rest = max(energy - explained, 1e-3 * energy, 1e-9)
@@ -84,18 +84,18 @@ class MlSoft(Decoding):
     """Sum of per-pixel log-likelihood ratios, by how many events of which sign a value's two chips have.
 
     Pilots are known, so each frame shows how often a value of +1 or -1 comes with which pair of polarity
-    sums, missed and late events included: two histograms over the pixels of all clusters. Their
-    log ratio says what a pair of sums is worth, in the info segment of the same frame. Where the camera sends
-    no negative events, silence in both chips counts for what it is worth, too.
+    sums, missed and late events included: two histograms over the pixels of all clusters. Their log ratio is
+    the evidence of a pair of sums in the info segment of the same frame. Where the camera sends no negative
+    events, silence in both chips is evidence, too.
 
     A pixel whose pilot does not fit its cluster shows something else, too, a panel or leaves, and one that is
-    dark shows nothing: each counts by the probability that it shows the cluster, by Bayes' rule.
+    dark shows nothing: each is weighted by the probability that it shows the cluster, by Bayes' rule.
     """
 
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's pilots and codewords."""
         codebook.require_pairs("decoding", "ml-soft", "edges")
-        decoder = LearnedDecoder(codebook)
+        decoder = MlDecoder(codebook)
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             return decoder.decode(presence.apply_prior(), sums)[0]
@@ -103,7 +103,7 @@ class MlSoft(Decoding):
         return decode
 
 
-class LearnedDecoder:
+class MlDecoder:
     """`MlSoft` for the pilots and codewords of a codebook of pair codes."""
 
     def __init__(self, codebook: Codebook) -> None:
@@ -117,7 +117,7 @@ class LearnedDecoder:
     def decode(
         self, presence: PresenceMap, sums: NDArray[np.int16]
     ) -> tuple[SoftSymbols, float, NDArray[np.uint8], NDArray[np.float64]]:
-        """The likeliest codewords by what all pixels that show a cluster say.
+        """Decode the likeliest codewords by all pixels that show a cluster.
 
         Args:
             presence: Of the frame.
@@ -130,12 +130,14 @@ class LearnedDecoder:
         """
         pairs = np.empty((len(sums) // 2, sums[0].size), np.uint8)
         seen, width, grid = to_kernel_array(presence.probability), sums.shape[2], presence.grid_px
-        worth = np.empty((2 * MAX_EVENTS + 1) ** 2)
-        _kernels.learn_worth(
-            to_kernel_array(sums), MAX_EVENTS, self._signs, seen, grid, _PRIOR_COUNT, pairs, worth
+        pair_llr = np.empty((2 * MAX_EVENTS + 1) ** 2)
+        _kernels.learn_pair_llr(
+            to_kernel_array(sums), MAX_EVENTS, self._signs, seen, grid, _PRIOR_COUNT, pairs, pair_llr
         )
         values = np.zeros((len(seen), len(pairs) - self._signs.shape[1]))
         odds = (1 - _PIXEL_SHARE) / _PIXEL_SHARE
-        _kernels.sum_worth(pairs, width, self._signs, seen, grid, worth, (_MIN_LEARNT_WEIGHT, odds), values)
+        _kernels.sum_pair_llr(
+            pairs, width, self._signs, seen, grid, pair_llr, (_MIN_SOFT_WEIGHT, odds), values
+        )
         symbols, _, margins, agreement, least = match_words(values, self._by_value, self._bits)
-        return SoftSymbols(symbols, margins.astype(np.float32), agreement), least, pairs, worth
+        return SoftSymbols(symbols, margins.astype(np.float32), agreement), least, pairs, pair_llr

@@ -9,7 +9,7 @@ from evlcp_sdk.air.codebook import chips_of_values, hadamard
 from evlcp_sdk.plugin.roles import Modulation
 
 
-def _signed_rows(order: int) -> NDArray[np.int8]:
+def _hadamard_words(order: int) -> NDArray[np.int8]:
     rows = hadamard(order)
     return np.concatenate([rows, -rows])
 
@@ -24,7 +24,7 @@ class Wh4x2(Modulation):
 
     def codewords(self) -> NDArray[np.uint8]:
         """uint8 (64, 16)."""
-        words = _signed_rows(4)
+        words = _hadamard_words(4)
         return chips_of_values(np.concatenate([np.repeat(words, 8, axis=0), np.tile(words, (8, 1))], axis=1))
 
 
@@ -34,7 +34,7 @@ class Wh8(Modulation):
 
     def codewords(self) -> NDArray[np.uint8]:
         """uint8 (16, 16)."""
-        return chips_of_values(_signed_rows(8))
+        return chips_of_values(_hadamard_words(8))
 
 
 @dataclass(frozen=True)

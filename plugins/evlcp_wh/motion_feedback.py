@@ -1,4 +1,4 @@
-"""What the info segment of each cluster says, after the bar's motion within the frame is taken out."""
+"""Decoding of the info segment of each cluster after the bar's motion within the frame is removed."""
 
 from dataclasses import dataclass
 from itertools import groupby
@@ -13,7 +13,7 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols, replace_fields, to_kernel_array
 from evlcp_wh import _kernels
-from evlcp_wh.decoding import INDEPENDENT_PIXELS, LearnedDecoder
+from evlcp_wh.decoding import INDEPENDENT_PIXELS, MlDecoder
 from evlcp_wh.separation import CellPosterior
 
 _UNSURE_LLR = 2.0
@@ -21,33 +21,33 @@ _UNSURE_LLR = 2.0
 wrong."""
 
 _SURE_LLR = 20.0
-"""Log-likelihood ratio of every bit from which on a frame is read once only."""
+"""Log-likelihood ratio of every bit from which on a frame is decoded once only."""
 
 _STEP_PX = 0.3
-"""Likely change of place (sigma) from value to value: 1.5 px/ms for 0.2 ms."""
+"""Prior sigma of the change of place from value to value: 1.5 px/ms for 0.2 ms."""
 
 _PLACE_PX = 1.0
-"""Likely distance (sigma) of the bar from its place."""
+"""Prior sigma of the bar's distance from its place."""
 
 _ROUNDS = 2
-"""How often motion and symbols are found: what is read in the first round tells the motion in the second."""
+"""Rounds of motion and symbols: the symbols of the first round give the motion of the second."""
 
 
 @dataclass(frozen=True)
 class MotionFeedback(Decoding):
-    """Decision feedback of motion: find from the chips where the bar was, take it back, decode, again.
+    """Decision feedback of motion: find from the chips where the bar was, remove the motion, decode, again.
 
     The clusters' pixel maps and the values that they send make the image that each value should give; its
-    match with the events, pixel by pixel in log-likelihood ratios as `ml-soft` learns them, shows how
-    likely the bar was so many pixels off its place then. In the first round the pilot's values are known,
-    and each info value of a cluster is the one that fits better; in the second all are known from the
-    decision. The likeliest smooth path over all values (Viterbi) is taken back from the sums, the clusters
-    are separated again by their pilots, and their info segments decoded. A frame whose path stays at 0 is
-    decoded as by `ml-soft`; one whose path comes within a pixel of the border of what is searched, or leaves
-    a bit unsure, is searched farther.
+    match with the events, pixel by pixel in log-likelihood ratios as `ml-soft` learns them, shows how likely
+    the bar was so many pixels off its place then. In the first round the pilot's values are known, and each
+    info value of a cluster is the one that fits better; in the second all are known from the decision. The
+    likeliest smooth path over all values (Viterbi) is removed from the sums, the clusters are separated again
+    by their pilots, and their info segments decoded. A frame whose path stays at 0 is decoded as by
+    `ml-soft`; one whose path comes within a pixel of the border of what is searched, or leaves a bit unsure,
+    is searched farther.
 
     A path that started from decisions alone would confirm a wrong one: a bar off by the spacing of its
-    clusters says its neighbours' symbols without a fault.
+    clusters decodes to its neighbours' symbols without a fault.
     """
 
     reach_px: Annotated[
@@ -60,32 +60,32 @@ class MotionFeedback(Decoding):
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's pilots and codewords."""
         codebook.require_pairs("decoding", "motion-feedback", "edges")
-        decoder, posterior = LearnedDecoder(codebook), CellPosterior(codebook.pilot_edges.astype(np.int64))
+        decoder, posterior = MlDecoder(codebook), CellPosterior(codebook.pilot_edges.astype(np.int64))
         pilots, words = to_kernel_array(codebook.pilot_edges), codebook.codeword_edges
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             presence, sums = presence.apply_prior(), to_kernel_array(sums)
-            soft, least, pairs, worth = decoder.decode(presence, sums)
+            soft, least, pairs, pair_llr = decoder.decode(presence, sums)
             if least >= _SURE_LLR:
                 return soft
-            matches = match_shifts(presence, pairs, worth, self.reach_px)
-            read, beyond = feed_back(presence, sums, soft, matches)
+            matches = match_shifts(presence, pairs, pair_llr, self.reach_px)
+            refined, beyond = refine(presence, sums, soft, matches)
             if beyond and self.far_px > self.reach_px:
-                matches = match_shifts(presence, pairs, worth, self.far_px)
-                read, _ = feed_back(presence, sums, soft, matches)
-            return read
+                matches = match_shifts(presence, pairs, pair_llr, self.far_px)
+                refined, _ = refine(presence, sums, soft, matches)
+            return refined
 
-        def feed_back(
+        def refine(
             presence: PresenceMap,
             sums: NDArray[np.int16],
             soft: SoftSymbols,
             matches: NDArray[np.float32],
         ) -> tuple[SoftSymbols, bool]:
-            """What is read with the path taken back, and whether the path may lie beyond what is searched.
+            """Decode with the motion removed; return whether the motion may be beyond the shifts searched.
 
-            The best path may go on beyond the border. Where it does not come there, it may have gone over to
-            the same clusters a spacing back: what it passed on the way contradicts what it reads, and leaves
-            a bit unsure. What was read until then does not count.
+            The best path may go on beyond the border. Where it does not come there, it may have switched to
+            the same clusters a spacing back: what it passed on the way contradicts the symbols, and leaves a
+            bit unsure. What was decoded until then does not count.
             """
             known, least, reach_px = pilots, inf, matches.shape[1] // 2
             done = [[0, 0]] * matches.shape[3]
@@ -95,7 +95,7 @@ class MotionFeedback(Decoding):
                     return soft, True
                 if path == done:
                     break
-                still, done = take_back(sums, path), path
+                still, done = remove_motion(sums, path), path
                 probability = posterior.probability(still, presence.grid_px)
                 presence = replace_fields(presence, probability=probability).apply_prior()
                 soft, least, *_ = decoder.decode(presence, still)
@@ -106,11 +106,11 @@ class MotionFeedback(Decoding):
 
 
 def match_shifts(
-    presence: PresenceMap, pairs: NDArray[np.uint8], worth: NDArray[np.float64], reach_px: int
+    presence: PresenceMap, pairs: NDArray[np.uint8], pair_llr: NDArray[np.float64], reach_px: int
 ) -> NDArray[np.float32]:
     """Log-likelihood ratio of each value of each cluster, by the shift of the bar from its place.
 
-    A pixel without events counts 0: what it is worth adds the same wherever the bar is.
+    A pixel without events counts 0: its evidence adds the same wherever the bar is.
 
     Returns:
         float32 (K, n, n, values), from `reach_px` up and left to as much down and right.
@@ -119,14 +119,15 @@ def match_shifts(
     side = 2 * reach_px + 1
     out = np.zeros((len(prior), side, side, len(pairs)), np.float32)
     maps, grid = to_kernel_array(presence.pixels), presence.grid_px
-    _kernels.match_shifts(pairs, worth, INDEPENDENT_PIXELS, maps, to_kernel_array(prior), grid, out)
+    _kernels.match_shifts(pairs, pair_llr, INDEPENDENT_PIXELS, maps, to_kernel_array(prior), grid, out)
     return out
 
 
 def find_path(matches: NDArray[np.float32], known: NDArray[np.int8]) -> NDArray[np.int64]:
-    """Shift (down, right) of the bar from its place in each value, int64 (values, 2), px.
+    """Find the shift (down, right) of the bar from its place in each value, int64 (values, 2), px.
 
-    `known` are the codes of the first n values, (K, n); of the others, each cluster's is what fits better.
+    `known` are the codes of the first n values, (K, n); of the others, each cluster's is the one that fits
+    better.
     """
     values = matches.shape[3]
     path = np.empty((values, 2), np.int64)
@@ -135,8 +136,8 @@ def find_path(matches: NDArray[np.float32], known: NDArray[np.int8]) -> NDArray[
     return path
 
 
-def take_back(sums: NDArray[np.int16], path: list[list[int]]) -> NDArray[np.int16]:
-    """Polarity sums with each value's shift (down, right) taken back; 0 where there was no pixel."""
+def remove_motion(sums: NDArray[np.int16], path: list[list[int]]) -> NDArray[np.int16]:
+    """Shift polarity sums back by each value's (down, right); pixels from outside the image are 0."""
     _, height, width = sums.shape
     out, first = np.zeros_like(sums), 0
     # Neighbouring values mostly share a shift.

@@ -1,4 +1,4 @@
-"""Which cluster does a part of the image show."""
+"""Separation of clusters by the correlation of cells with pilots."""
 
 from dataclasses import dataclass
 from math import log
@@ -14,13 +14,13 @@ from evlcp_sdk.values import PresenceMap, to_kernel_array
 from evlcp_wh import _kernels
 
 _VALUE_ERROR = 0.1
-"""Probability that a cell's value is seen wrong: of a cell half beside the bar, which is one of four."""
+"""Probability that a cell's value is wrong: of a cell half beside the bar, which is one of four."""
 
 _MIN_VALUES = 4
-"""Values that must be seen in a cell for it to show a cluster: half of a pilot tells it from most others."""
+"""Values with events that a cell needs to show a cluster: half of a pilot excludes most others."""
 
 _MIN_PROBABILITY = 0.5
-"""Presence probability that selects a cell: rather one cluster than any other, or none."""
+"""Presence probability that selects a cell: more likely one cluster than any other, or none."""
 
 
 class CellPosterior:
@@ -30,15 +30,17 @@ class CellPosterior:
         self._pilots = pilots
         clusters, n = pilots.shape
         agree, disagree = log((1 - _VALUE_ERROR) / 0.5), log(_VALUE_ERROR / 0.5)
-        self._beside = np.exp(np.arange(2 * n + 1) * (disagree - agree) / 2)
+        self._ratios = np.exp(np.arange(2 * n + 1) * (disagree - agree) / 2)
         seen, best = np.arange(n + 1)[:, None], np.arange(-n, n + 1)
-        self._none = clusters * np.exp(-(agree * (seen + best) + disagree * (seen - best)) / 2)
+        self._none_ratios = clusters * np.exp(-(agree * (seen + best) + disagree * (seen - best)) / 2)
 
     def probability(self, sums: NDArray[np.int16], grid_px: int) -> NDArray[np.float32]:
         """Of each cluster in each cell, float32 (K, rows, columns), by polarity sums, pilot first."""
         _, height, width = sums.shape
         out = np.zeros((len(self._pilots), height // grid_px, width // grid_px), np.float32)
-        _kernels.presence(sums, self._pilots, grid_px, self._beside, self._none, _MIN_VALUES, out)
+        _kernels.estimate_presence(
+            sums, self._pilots, grid_px, self._ratios, self._none_ratios, _MIN_VALUES, out
+        )
         return out
 
 
@@ -63,7 +65,7 @@ class WhCorrelation(Separation):
             probability = posterior.probability(sums, self.grid_px)
             selected, grid = np.empty(probability.shape, np.bool_), self.grid_px
             pixels = np.zeros((len(codes), *sums.shape[1:]), np.float32)
-            _kernels.pixel_maps(sums, codes, grid, probability, _MIN_PROBABILITY, selected, pixels)
+            _kernels.map_pixels(sums, codes, grid, probability, _MIN_PROBABILITY, selected, pixels)
             return PresenceMap(probability, grid, selected, pixels)
 
         return separate

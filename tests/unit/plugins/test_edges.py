@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from evlcp_edges.decoding import EdgeDecoding
-from evlcp_edges.dimmed import DimmedPilots, DimmedWh4x2, dimmed_chips
+from evlcp_edges.dimmed import DimmedPilots, DimmedWh4x2, pulse_chips
 from evlcp_edges.modulation import Nrz, Ppm
 from evlcp_edges.separation import EdgeSeparation
 from evlcp_wh.modulation import Wh4x2
@@ -58,8 +58,8 @@ def test_dimmed_codes_are_lit_once_a_value(slots):
         assert (values.sum(-1) == 1).all()
         assert not values[..., 0].any()
     pairs = 2 * Wh4x2().codewords()[:, 1::2].astype(int) - 1
-    assert dimmed_chips(pairs, slots).tolist() == words.tolist()
-    assert dimmed_chips([1, -1, -1], 2).tolist() == chips_of_values([1, -1, -1]).tolist()
+    assert pulse_chips(pairs, slots).tolist() == words.tolist()
+    assert pulse_chips([1, -1, -1], 2).tolist() == chips_of_values([1, -1, -1]).tolist()
 
 
 @pytest.mark.parametrize("seed", range(2))

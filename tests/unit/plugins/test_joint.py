@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from evlcp_joint import _kernels
-from evlcp_joint.ranging import JointScaleRanging, profile
+from evlcp_joint.ranging import JointScaleRanging, boundary_profile
 from numpy.testing import assert_allclose
 from scipy.stats import norm
 
@@ -181,7 +181,7 @@ def fit_of(codes, dim, values, spacing, offset_px=STILL):
     reported = codes, codes[:, :0].copy(), np.zeros(K, np.int64), np.ones(K, np.bool_)
     fit = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
     (variance, *_), by_boundary = _kernels.fit_bar(
-        reported, offset_px, values, profile(1.0), (0.45, dim), 6, fit
+        reported, offset_px, values, boundary_profile(1.0), (0.45, dim), 6, fit
     )
     assert variance > 0
     return fit, by_boundary[:, 1:-1]

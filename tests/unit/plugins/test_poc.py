@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from evlcp_centroid.ranging import CentroidRanging
 from evlcp_poc import _kernels
-from evlcp_poc.correlation import blob_band, full_band, pair_shifts, phase_only_correlation
+from evlcp_poc.correlation import blob_band, full_band, measure_shifts, phase_only_correlation
 from evlcp_poc.ranging import PocRanging
 from numpy.testing import assert_allclose
 from scipy.stats import norm
@@ -122,7 +122,7 @@ def test_exact_shifts_are_recovered(samples, shape, most):
     first, second = np.triu_indices(len(by), 1)
     near = np.abs(by[second] - by[first]).max(1) < 5
     pairs, band = (first[near], second[near]), most or full_band(*shape)
-    shifts = pair_shifts(images, shape, pairs, band, 5, samples)
+    shifts = measure_shifts(images, shape, pairs, band, 5, samples)
     correlation = phase_only_correlation(images, shape, pairs, band, range(-3, 5), range(-2, 2))
     want = twin_correlation(*(images.swapaxes(0, 1)[some] for some in pairs), *band)
     want = want[:, np.arange(-3, 5)[:, None], np.arange(-2, 2)]
@@ -299,7 +299,7 @@ def test_a_shift_in_noise_and_its_bound(spacing_px, noise):
     first, size, ratio = 2 * np.arange(pairs), (rows, columns), {}
     blob = blob_band(images.swapaxes(0, 1), size)
     for name, most in {"full": full_band(rows, columns), "blob": blob}.items():
-        shifts = pair_shifts(noisy, size, (first, first + 1), most, 4, 2)
+        shifts = measure_shifts(noisy, size, (first, first + 1), most, 4, 2)
         ratio[name] = np.sqrt(((shifts[:, 0] - by[:, 0]) ** 2).mean()) / bound
     # Seen: 4.9 to 6.7, and 1.3 to 2.5.
     assert ratio["full"] > 4

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from evlcp_wh.decoding import LearnedDecoder, MlSoft, WhTransform
+from evlcp_wh.decoding import MlDecoder, MlSoft, WhTransform
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
 from evlcp_wh.motion_feedback import MotionFeedback, find_path, match_shifts
 from evlcp_wh.pilots import WhPilots
@@ -183,7 +183,7 @@ def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, s
     assert_array_equal(soft.llr < 0, bits_of(symbols, book.bits_per_symbol) == 1)
     if right_down[1]:
         assert (MlSoft().compile(book)(presence, sums).symbols != symbols).any()
-    _, _, *learnt = LearnedDecoder(book).decode(presence, sums)
+    _, _, *learnt = MlDecoder(book).decode(presence, sums)
     matches = match_shifts(presence, *learnt, 4)
     known = np.concatenate([book.pilot_edges, book.codeword_edges[symbols]], axis=1)
     assert_array_equal(find_path(matches, known), path)
