@@ -165,7 +165,7 @@ class Reception(Iterator[Packet]):
                 for events in _events_of(self.source, self._pulses):
                     yield from self.receiver.feed(events)
             except (PluginError, WorkerError):
-                yield from self.receiver.left
+                yield from self.receiver.pending_packets
                 raise
             except InputError:
                 yield from self.receiver.close()
@@ -449,10 +449,10 @@ def _run(
                 except StopIteration:
                     break
                 except (PluginError, WorkerError) as fault:
-                    if not given and not receiver.left:
+                    if not given and not receiver.pending_packets:
                         raise
                     # What it has let through is kept; the receiver cannot be asked for more.
-                    writer.write(receiver.left)
+                    writer.write(receiver.pending_packets)
                     status, error, broken = "failed", str(fault), fault
                     break
                 if len(events):

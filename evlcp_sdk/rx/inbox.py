@@ -15,80 +15,81 @@ from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.rx.guard import Guard
-from evlcp_sdk.rx.trust import BeaconJudge, Standing, signed_text
+from evlcp_sdk.rx.trust import BeaconVerifier, TrustVerdict, describe_signature
 from evlcp_sdk.utc import ClockZero, clock_zero_at
 from evlcp_sdk.values import Packet, ReceivedMessage, replace_fields
 
 _LLR_POWER, _MOST_LLR = 0.5, 7.0
-"""Power that sizes of LLRs are raised to, as decoders are surer within a burst than they are right, and the
-largest after that: no bit is surer than the sync it hangs on, which is wrong once in a thousand."""
+"""Power that magnitudes of LLRs are raised to, as decoders are overconfident within a burst, and their limit
+after that: no bit is surer than the sync that it depends on, which is wrong once in a thousand."""
 
 _SAME_BLOCK_SIGMA = 6.0
-"""Agreement of two packets' soft bits from which on they carry one block: by chance once in 1e9 pairs."""
+"""Agreement of two packets' soft bits from which on they carry the same block: by chance once in 1e9
+pairs."""
 
 _MOST_TRANSMITTERS = 16
-"""Transmitters whose messages are collected; the one not received for longest makes way."""
+"""Transmitters whose messages are collected: those received last."""
 
 _MOST_MESSAGES = 8
-"""Messages of a transmitter that are collected at a time, and that are remembered when complete."""
+"""Messages of a transmitter that are collected at a time, and complete ones that are remembered."""
 
 _Key = tuple[int, int, int]
 
 
 @dataclass
-class _Sum:
-    """Packets of one block that is not decoded yet: the sum of their LLRs, float32 (bits,), and how many."""
+class _BlockSum:
+    """The sum of the LLRs of packets with the same block, float32 (bits,), which is not decoded yet."""
 
     llr: NDArray[np.float32]
     packets: int
 
 
 @dataclass
-class _Parts:
+class _PartialMessage:
     """A message as far as it is known.
 
     Attributes:
         length: Its bytes.
-        carried: Bytes that all its parts carry.
+        total: Bytes that all its parts carry.
         parts: Known parts by number.
         payload: Its bytes, once all are known.
-        given: The trust last handed on, and why not more; None before.
+        delivered: The verdict that was delivered last; None before.
     """
 
     length: int
-    carried: int
+    total: int
     parts: dict[int, bytes] = field(default_factory=dict)
     payload: bytes = b""
-    given: Standing | None = None
+    delivered: TrustVerdict | None = None
 
 
 @dataclass
 class _Inbox:
-    """What is known of one transmitter's messages, in bounded memory."""
+    """Blocks and messages of one transmitter, in bounded memory."""
 
-    sums: list[_Sum] = field(default_factory=list)
-    open: OrderedDict[_Key, _Parts] = field(default_factory=OrderedDict)
-    done: OrderedDict[_Key, _Parts] = field(default_factory=OrderedDict)
+    sums: list[_BlockSum] = field(default_factory=list)
+    incomplete: OrderedDict[_Key, _PartialMessage] = field(default_factory=OrderedDict)
+    complete: OrderedDict[_Key, _PartialMessage] = field(default_factory=OrderedDict)
 
 
 class MessageAssembler:
-    """Reads the blocks of packets and puts messages together, transmitter by transmitter.
+    """Decodes the blocks of packets and assembles messages from them, transmitter by transmitter.
 
     A packet is decoded by itself first. If that fails, its LLRs are added to those of earlier packets that
     carry the same block, if there are any, and the sum is decoded. Two packets carry the same block if the
     products of their soft bits add up to more than six standard deviations of what chance gives, whatever the
-    order in which the transmitter repeats its blocks. So a packet is decoded twice at most, and the
-    probability that noise is taken for a block is at most twice that of a single decoding.
+    order in which the transmitter repeats its blocks. So a packet is decoded twice at most, and noise is
+    taken for a block at most twice as often as in a single decoding.
 
     Args:
-        coder: How packets carry blocks.
+        coder: Decodes the blocks of packets.
         spec: The configuration.
-        kinds: The kinds of messages that are understood, by number; blocks of others count as malformed.
+        kinds: The known kinds of messages, by number; blocks of others count as malformed.
         guard: Names the error correction where it fails.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
 
     Attributes:
-        counts: What was tried, found and given up so far.
+        counts: Blocks and messages tried, decoded and lost so far.
 
     Raises:
         ConfigError: A trusted key is not valid, or there are keys and the extra `sign` is not installed.
@@ -107,7 +108,7 @@ class MessageAssembler:
         self._kinds = kinds
         self._spec = spec
         self._room = coder.block_bytes - HEADER_BYTES
-        self._beacons = BeaconJudge(spec, coder.digest)
+        self._beacon_verifier = BeaconVerifier(spec, coder.digest)
         self._clock_zero = clock_zero
         self._inboxes: OrderedDict[int, _Inbox] = OrderedDict()
         self.counts = dict.fromkeys(
@@ -136,11 +137,7 @@ class MessageAssembler:
 
     @classmethod
     def of(cls, link: Link, clock_zero: ClockZero = None) -> Self | None:
-        """What reads a link's messages; None where that is turned off, or packets are too short for them.
-
-        Args:
-            link: The link.
-            clock_zero: UTC of the camera clock's 0; None if it is not known.
+        """The assembler of a link's messages; None if that is turned off, or packets are too short for them.
 
         Raises:
             ConfigError: As above.
@@ -156,9 +153,9 @@ class MessageAssembler:
         return cls(coder, link.messages, link.kinds, guard, clock_zero)
 
     def add(self, packet: Packet) -> Packet:
-        """Read a packet; return it with its block and the messages that it completes.
+        """Decode a packet; return it with its block and the messages that it completes.
 
-        A reflection is left out: it repeats what its transmitter says, with more errors.
+        A reflection is left out: it repeats what its transmitter sends, with more errors.
         """
         if packet.echo_of is not None:
             self.counts["blocks_reflected"] += 1
@@ -166,9 +163,9 @@ class MessageAssembler:
         inbox = self._inboxes.setdefault(packet.transmitter, _Inbox())
         self._inboxes.move_to_end(packet.transmitter)
         while len(self._inboxes) > _MOST_TRANSMITTERS:
-            self._give_up(self._inboxes.popitem(last=False)[1])
+            self._abandon(self._inboxes.popitem(last=False)[1])
         self.counts["blocks_tried"] += 1
-        content, packets = self._content(inbox, self._llr(packet))
+        content, packets = self._decode_packet(inbox, self._calibrate_llr(packet))
         if content is None:
             self.counts["blocks_failed"] += 1
             return packet
@@ -181,43 +178,43 @@ class MessageAssembler:
         if block.codebook != self._coder.digest:
             self.counts["blocks_other_codebook"] += 1
             return packet
-        messages = tuple(self._take(inbox, block, packet))
+        messages = tuple(self._add_block(inbox, block, packet))
         return replace_fields(packet, block=block, block_packets=packets, messages=messages)
 
     def close(self) -> None:
-        """End the stream: what is still incomplete counts as missing."""
+        """End the stream: parts of incomplete messages count as missing."""
         for inbox in self._inboxes.values():
-            self._give_up(inbox)
+            self._abandon(inbox)
         self._inboxes.clear()
 
-    def _llr(self, packet: Packet) -> NDArray[np.float32]:
+    def _calibrate_llr(self, packet: Packet) -> NDArray[np.float32]:
         """Calibrated LLRs of a packet's bits in the order on air, 0 where a frame is missing."""
         llr = np.zeros((packet.sent, self._coder.bits // packet.sent), np.float32)
         for frame in packet.frames:
             llr[frame.frame] = frame.soft.llr.ravel()
         llr[np.isnan(llr)] = 0
-        size = np.minimum(np.abs(llr) ** _LLR_POWER, _MOST_LLR)
-        return np.copysign(size, llr).ravel()
+        magnitude = np.minimum(np.abs(llr) ** _LLR_POWER, _MOST_LLR)
+        return np.copysign(magnitude, llr).ravel()
 
-    def _content(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:
-        """The bytes of a packet's block and the packets it took; None if that is not known yet."""
-        found = self._block(llr)
-        if found is not None or not self._spec.combine_packets:
-            return found, 1
-        alike = [_agreement(llr, earlier.llr) for earlier in inbox.sums]
-        best = int(np.argmax(alike)) if alike else -1
-        if best < 0 or alike[best] < _SAME_BLOCK_SIGMA:
-            inbox.sums = [*inbox.sums, _Sum(llr, 1)][-self._spec.combine_packets :]
+    def _decode_packet(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:
+        """The bytes of a packet's block, None if they are not known yet, and the packets that it took."""
+        content = self._decode_block(llr)
+        if content is not None or not self._spec.combine_packets:
+            return content, 1
+        agreements = [_agreement(llr, earlier.llr) for earlier in inbox.sums]
+        best = int(np.argmax(agreements)) if agreements else -1
+        if best < 0 or agreements[best] < _SAME_BLOCK_SIGMA:
+            inbox.sums = [*inbox.sums, _BlockSum(llr, 1)][-self._spec.combine_packets :]
             return None, 0
         self.counts["blocks_alike"] += 1
-        one = inbox.sums.pop(best)
-        total = _Sum(one.llr + llr, one.packets + 1)
-        found = self._block(total.llr)
-        if found is None:
+        earlier = inbox.sums.pop(best)
+        total = _BlockSum(earlier.llr + llr, earlier.packets + 1)
+        content = self._decode_block(total.llr)
+        if content is None:
             inbox.sums.append(total)
-        return found, total.packets
+        return content, total.packets
 
-    def _block(self, llr: NDArray[np.float32]) -> bytes | None:
+    def _decode_block(self, llr: NDArray[np.float32]) -> bytes | None:
         try:
             return self._coder.decode_block(llr)
         except (Exception, SystemExit) as fault:
@@ -225,98 +222,98 @@ class MessageAssembler:
                 self._guard.reraise(fault)
             raise
 
-    def _take(self, inbox: _Inbox, block: Block, packet: Packet) -> list[ReceivedMessage]:
-        """Put a block into its message; give what can be handed on now."""
+    def _add_block(self, inbox: _Inbox, block: Block, packet: Packet) -> list[ReceivedMessage]:
+        """Add a block to its message; return what can be delivered now."""
         key = (block.transmitter_id, block.kind, block.sequence)
-        known = inbox.done.get(key) or inbox.open.get(key)
+        known = inbox.complete.get(key) or inbox.incomplete.get(key)
         if known and known.length == block.length and known.parts.get(block.index) == block.part:
             self.counts["parts_repeated"] += 1
-            return self._hand_on(inbox, key, packet)
+            return self._deliver(inbox, key, packet)
         if known and (known.length != block.length or block.index in known.parts):
             # Two messages under one number: the later one is collected anew.
             self.counts["parts_conflicting"] += 1
-            inbox.done.pop(key, None)
-            self._missing(inbox.open.pop(key, None))
-        carried = total_bytes(block.length, self._room)
-        parts = inbox.open.setdefault(key, _Parts(block.length, carried))
-        inbox.open.move_to_end(key)
-        parts.parts[block.index] = block.part
-        while len(inbox.open) > _MOST_MESSAGES:
-            self._missing(inbox.open.popitem(last=False)[1])
-        if sum(map(len, parts.parts.values())) != parts.carried:
+            inbox.complete.pop(key, None)
+            self._count_missing(inbox.incomplete.pop(key, None))
+        total = total_bytes(block.length, self._room)
+        partial = inbox.incomplete.setdefault(key, _PartialMessage(block.length, total))
+        inbox.incomplete.move_to_end(key)
+        partial.parts[block.index] = block.part
+        while len(inbox.incomplete) > _MOST_MESSAGES:
+            self._count_missing(inbox.incomplete.popitem(last=False)[1])
+        if sum(map(len, partial.parts.values())) != partial.total:
             return []
         try:
-            parts.payload = join_parts([parts.parts[i] for i in sorted(parts.parts)], parts.length)
+            partial.payload = join_parts([partial.parts[i] for i in sorted(partial.parts)], partial.length)
         except BlockError:
             # Two messages under one number, mixed: the newest part is surely of the newest.
             self.counts["messages_mixed"] += 1
-            parts.parts = {block.index: block.part}
+            partial.parts = {block.index: block.part}
             return []
-        inbox.done[key] = inbox.open.pop(key)
-        while len(inbox.done) > _MOST_MESSAGES:
-            inbox.done.popitem(last=False)
-        return self._hand_on(inbox, key, packet)
+        inbox.complete[key] = inbox.incomplete.pop(key)
+        while len(inbox.complete) > _MOST_MESSAGES:
+            inbox.complete.popitem(last=False)
+        return self._deliver(inbox, key, packet)
 
-    def _hand_on(self, inbox: _Inbox, key: _Key, packet: Packet) -> list[ReceivedMessage]:
-        """A complete message, if it is new or its trust has changed; a signature's is its beacon."""
+    def _deliver(self, inbox: _Inbox, key: _Key, packet: Packet) -> list[ReceivedMessage]:
+        """A complete message, if it is new or its verdict has changed; a signature delivers its beacon."""
         transmitter_id, number, sequence = key
         if number == Kind.SIGNATURE:
             key = (transmitter_id, Kind.BEACON, sequence)
-        parts = inbox.done.get(key)
-        if parts is None:
+        known = inbox.complete.get(key)
+        if known is None:
             return []
-        inbox.done.move_to_end(key)
-        message = Message(key[1], transmitter_id, sequence, parts.payload)
+        inbox.complete.move_to_end(key)
+        message = Message(key[1], transmitter_id, sequence, known.payload)
         kind = self._kinds[message.kind]
         try:
             value = kind.unpack(message.payload)
         except (Exception, SystemExit):
-            # Whatever a lamp says, and whatever a plugin makes of it, the receiver goes on.
-            return self._undecodable(parts)
+            # Whatever a lamp sends, and whatever a plugin makes of it, the receiver goes on.
+            self._count_undecodable(known)
+            return []
         beacon = value if message.kind == Kind.BEACON else None
-        verdict, now_s = Standing("unverified", "not signed"), None
+        verdict, now_s = TrustVerdict("unverified", "not signed"), None
         if message.kind in (Kind.BEACON, Kind.TIME):
             zero = clock_zero_at(self._clock_zero, packet.t_us)
             now_s = None if zero is None else zero.timestamp() + packet.t_us * 1e-6
         if beacon is not None:
-            signed = inbox.done.get((transmitter_id, Kind.SIGNATURE, sequence))
+            signed = inbox.complete.get((transmitter_id, Kind.SIGNATURE, sequence))
             signature = None
             if signed is not None:
                 signature = Message(Kind.SIGNATURE, transmitter_id, sequence, signed.payload)
-            verdict = self._beacons.judge(message, beacon, signature, now_s)
-        if verdict == parts.given:
+            verdict = self._beacon_verifier.verify(message, beacon, signature, now_s)
+        if verdict == known.delivered:
             return []
-        self.counts["messages"] += parts.given is None
-        if beacon is not None and (parts.given is None or parts.given.trust != verdict.trust):
+        self.counts["messages"] += known.delivered is None
+        if beacon is not None and (known.delivered is None or known.delivered.trust != verdict.trust):
             self.counts[f"beacons_{verdict.trust}"] += 1
             self.counts["beacons_undated"] += verdict.trust == "verified" and now_s is None
-        parts.given = verdict
+        known.delivered = verdict
         where = (packet.transmitter, packet.packet, packet.t_us)
-        reason, age_s = verdict.why, None
+        reason, age_s = verdict.reason, None
         if verdict.trust == "verified":
-            reason, age_s = signed_text(message, now_s)
+            reason, age_s = describe_signature(message, now_s)
         elif message.kind == Kind.TIME and now_s is not None:
             age_s = now_s - value
         return [ReceivedMessage(*where, message, kind, value, verdict.trust, reason, age_s, packet.link)]
 
-    def _undecodable(self, parts: _Parts) -> list[ReceivedMessage]:
+    def _count_undecodable(self, known: _PartialMessage) -> None:
         """Count a message whose bytes mean nothing, once."""
-        if parts.given is None:
-            parts.given = Standing("unverified", "undecodable")
+        if known.delivered is None:
+            known.delivered = TrustVerdict("unverified", "undecodable")
             self.counts["messages_undecodable"] += 1
-        return []
 
-    def _missing(self, parts: _Parts | None) -> None:
-        if parts is not None:
-            self.counts["parts_missing"] += -(-parts.carried // self._room) - len(parts.parts)
+    def _count_missing(self, partial: _PartialMessage | None) -> None:
+        if partial is not None:
+            self.counts["parts_missing"] += -(-partial.total // self._room) - len(partial.parts)
 
-    def _give_up(self, inbox: _Inbox) -> None:
-        for parts in inbox.open.values():
-            self._missing(parts)
+    def _abandon(self, inbox: _Inbox) -> None:
+        for partial in inbox.incomplete.values():
+            self._count_missing(partial)
 
 
 def _agreement(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    """How much two packets' soft bits agree, in standard deviations of what independent bits would."""
+    """Agreement of two packets' soft bits, in standard deviations of that of independent bits."""
     product = a.astype(np.float64) * b
     spread = float(np.vdot(product, product)) ** 0.5
     return float(product.sum()) / spread if spread else 0.0

@@ -1,10 +1,11 @@
-"""Several links at once, and which of them a packet is of: what explains most of the light in its place.
+"""Arbitrate between several links: which of them a packet belongs to.
 
 A region is tried by each link, and where codes or layouts are akin, more than one may read something there:
 a bar by half of its clusters, symbols of another modulation, characters in what is none. So packets wait
-until every link had its time to answer. What a packet explains of the light is the time of its clusters whose
-symbols are right, by their LLRs: seconds of light are the same for all links, however many bits their symbols
-have. A transmitter that explains half of its light holds its place: other links let their regions there go.
+until every link had its time to answer. The link that explains most of the light in a place wins. A packet
+explains the time of its clusters whose symbols are right, by their LLRs: seconds of light are the same for
+all links, however many bits their symbols have. A transmitter that explains half of its light owns its place:
+other links drop their regions there.
 """
 
 from collections import Counter, OrderedDict, deque
@@ -22,20 +23,20 @@ from evlcp_sdk.values import Frame, Packet, Region, replace_fields
 _CLEARLY = 1.25
 """How many times more light one link explains than another before nothing else matters."""
 
-_HELD = 2.0
-"""What light counts of a link that holds the place: what wavers by less changes nothing."""
+_OWNER_WEIGHT = 2.0
+"""Weight of the light of a link that owns the place: what wavers by less changes nothing."""
 
-_OWNS = 0.5
-"""Share of the light that a packet explains by which its transmitter holds its place."""
+_OWNER_SHARE = 0.5
+"""Share of the light that a packet explains from which on its transmitter owns its place."""
 
-_MOST_KNOWN = 1024
-"""Transmitters of which is known where they were last."""
+_MOST_TRANSMITTERS = 1024
+"""Transmitters whose last places are known."""
 
 _MOST_FRAMES = 4096
-"""Frames that wait at a time; of more, the oldest are judged by what is known."""
+"""Frames that wait at a time; of more, the oldest are decided early."""
 
 
-def explained_us(packet: Packet, form: PacketFormat) -> float:
+def light_explained_us(packet: Packet, form: PacketFormat) -> float:
     """The light that a packet explains: the time of each cluster in which its symbols are right, us."""
     total = 0.0
     for frame in packet.frames:
@@ -46,35 +47,35 @@ def explained_us(packet: Packet, form: PacketFormat) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
-    """A packet that was decoded, and what it explains.
+class PacketCandidate:
+    """A decoded packet of one link, and the light that it explains.
 
     Attributes:
         link: Number of its link; of two that fit alike, the one with fewer codewords counts, or the first.
         packet: The packet.
         place: Where its transmitter was when it was complete.
-        from_us: Its start, us.
-        until_us: Its end, us.
-        leaves_us: When it is judged, us.
-        light_us: What it explains, us.
-        whole_us: All there is to explain, us.
+        start_us: Its start, us.
+        end_us: Its end, us.
+        decide_us: When it is decided whether it fits, us.
+        light_us: The light that it explains, us.
+        total_light_us: All light that there is to explain, us.
     """
 
     link: int
     packet: Packet
     place: Region
-    from_us: float
-    until_us: float
-    leaves_us: float
+    start_us: float
+    end_us: float
+    decide_us: float
     light_us: float
-    whole_us: float
+    total_light_us: float
 
 
-class SeveralLinks:
-    """Lets packets of several links wait until the slowest has answered, and says which fit their place best.
+class LinkArbiter:
+    """Holds packets of several links until the slowest has answered, and decides which fit their place best.
 
     Attributes:
-        owning: Numbers of the transmitters that hold their places.
+        owners: Numbers of the transmitters that own their places.
     """
 
     def __init__(self, links: Collection[Link], patience_us: float) -> None:
@@ -82,182 +83,180 @@ class SeveralLinks:
         self._gap_px = max(link.regions.merge_px for link in links)
         self._wait_us = patience_us + self._links[0].regions.step_us
         self._longest_us = max(link.packet.packet_chips * link.packet.chip_us for link in links)
-        self._waiting: deque[Shown] = deque()
-        self._judged: deque[Shown] = deque()
+        self._waiting: deque[PacketCandidate] = deque()
+        self._decided: deque[PacketCandidate] = deque()
         self._frames = 0
         self._places: list[Mapping[int, Region]] = [{} for _ in links]
-        self._known: dict[int, Region] = {}
-        self.owning: set[int] = set()
+        self._last_places: dict[int, Region] = {}
+        self.owners: set[int] = set()
 
     def __bool__(self) -> bool:
-        """Whether anything waits."""
+        """Whether any packet waits."""
         return bool(self._waiting)
 
-    def taken(self, link: int) -> list[Region]:
-        """Places that transmitters of other links hold, with the gap below which areas are one."""
+    def owned_places(self, link: int) -> list[Region]:
+        """Places that transmitters of other links own, extended as by `extend_place`."""
         return [
-            self.around(place)
+            self.extend_place(place)
             for other, places in enumerate(self._places)
             if other != link
             for number, place in places.items()
-            if number in self.owning
+            if number in self.owners
         ]
 
-    def around(self, place: Region) -> Region:
-        """A place with the gap below which areas are one."""
-        return _grown(place, 2 * self._gap_px)
+    def extend_place(self, place: Region) -> Region:
+        """A place with a seam of the gap below which areas are one."""
+        return _extend_region(place, 2 * self._gap_px)
 
     def add(self, link: int, places: Mapping[int, Region], packets: Iterable[Packet], now_us: float) -> None:
-        """Take where a link's transmitters are now, by their numbers, and the packets that it has decoded."""
+        """Add the packets that a link has decoded, and where its transmitters are now, by their numbers."""
         self._places[link] = places
         for number, place in places.items():
-            self._known.pop(number, None)
-            self._known[number] = place
-        while len(self._known) > _MOST_KNOWN:
-            number = next(iter(self._known))
-            del self._known[number]
-            self.owning.discard(number)
+            self._last_places.pop(number, None)
+            self._last_places[number] = place
+        while len(self._last_places) > _MOST_TRANSMITTERS:
+            number = next(iter(self._last_places))
+            del self._last_places[number]
+            self.owners.discard(number)
         form, clusters = self._links[link].packet, self._links[link].codebook.clusters
         for packet in packets:
             newest = packet.frames[-1]
-            seen = self._known.get(packet.transmitter)
+            seen = self._last_places.get(packet.transmitter)
             size = (seen.width_px, seen.height_px) if seen is not None else (0.0, 0.0)
             place = Region(packet.transmitter, now_us, newest.x_px, newest.y_px, *size)
             long_us = form.packet_chips * packet.chip_us
             times = packet.t_us, packet.t_us + long_us, now_us + self._wait_us
-            light_us = explained_us(packet, form)
-            self._waiting.append(Shown(link, packet, place, *times, light_us, long_us * clusters))
+            light_us = light_explained_us(packet, form)
+            self._waiting.append(PacketCandidate(link, packet, place, *times, light_us, long_us * clusters))
             self._frames += len(packet.frames)
 
-    def judge(self, now_us: float) -> Iterator[tuple[Shown, bool]]:
-        """Give the packets that have waited long enough, and whether they fit."""
-        while self._waiting and (self._waiting[0].leaves_us <= now_us or self._frames > _MOST_FRAMES):
-            shown = self._waiting[0]
-            fits = self._winner(shown) == shown.link
-            self._frames -= len(shown.packet.frames)
-            self._judged.append(self._waiting.popleft())
-            owns = fits and shown.light_us >= _OWNS * shown.whole_us
-            (self.owning.add if owns else self.owning.discard)(shown.packet.transmitter)
-            yield shown, fits
+    def decide(self, now_us: float) -> Iterator[tuple[PacketCandidate, bool]]:
+        """Yield the packets that have waited long enough, and whether they fit."""
+        while self._waiting and (self._waiting[0].decide_us <= now_us or self._frames > _MOST_FRAMES):
+            candidate = self._waiting[0]
+            fits = self._find_best_link(candidate) == candidate.link
+            self._frames -= len(candidate.packet.frames)
+            self._decided.append(self._waiting.popleft())
+            owns = fits and candidate.light_us >= _OWNER_SHARE * candidate.total_light_us
+            (self.owners.add if owns else self.owners.discard)(candidate.packet.transmitter)
+            yield candidate, fits
         oldest_us = now_us - 2 * self._wait_us - self._longest_us
-        while self._judged and (self._judged[0].leaves_us < oldest_us or len(self._judged) > _MOST_FRAMES):
-            self._judged.popleft()
+        while self._decided and (self._decided[0].decide_us < oldest_us or len(self._decided) > _MOST_FRAMES):
+            self._decided.popleft()
 
-    def _winner(self, shown: Shown) -> int:
-        """The link that explains most of the light in a packet's place about its time."""
-        about = [
+    def _find_best_link(self, candidate: PacketCandidate) -> int:
+        """The link that explains most of the light in a packet's place around its time."""
+        nearby = [
             other
-            for other in (*self._judged, *self._waiting)
-            if max(other.from_us - shown.until_us, shown.from_us - other.until_us) <= self._wait_us
+            for other in (*self._decided, *self._waiting)
+            if max(other.start_us - candidate.end_us, candidate.start_us - other.end_us) <= self._wait_us
         ]
-        mine = [other for other in about if other.packet.transmitter == shown.packet.transmitter]
-        rivals = {shown.packet.transmitter}
-        rivals.update(
+        number = candidate.packet.transmitter
+        mine = [other for other in nearby if other.packet.transmitter == number]
+        rivals = {number} | {
             other.packet.transmitter
-            for other in about
-            if other.link != shown.link and any(self._overlap(one, other) for one in mine)
-        )
-        light, whole = dict.fromkeys((shown.link,), 0.0), dict.fromkeys((shown.link,), 0.0)
-        for other in about:
+            for other in nearby
+            if other.link != candidate.link and any(self._packets_overlap(one, other) for one in mine)
+        }
+        light, total = {candidate.link: 0.0}, {candidate.link: 0.0}
+        for other in nearby:
             if (number := other.packet.transmitter) in rivals:
-                held = _HELD if number in self.owning else 1.0
-                light[other.link] = light.get(other.link, 0.0) + held * other.light_us
-                whole[other.link] = whole.get(other.link, 0.0) + other.whole_us
+                weight = _OWNER_WEIGHT if number in self.owners else 1.0
+                light[other.link] = light.get(other.link, 0.0) + weight * other.light_us
+                total[other.link] = total.get(other.link, 0.0) + other.total_light_us
         best, *others = sorted(light)
-        for one in others:
-            if self._fits_better(one, best, light, whole):
-                best = one
+        for link in others:
+            if self._fits_better(link, best, light, total):
+                best = link
         return best
 
     def _fits_better(
-        self, one: int, than: int, light: Mapping[int, float], whole: Mapping[int, float]
+        self, link: int, other: int, light: Mapping[int, float], total: Mapping[int, float]
     ) -> bool:
-        """Whether a link fits better: by the light that it explains, and by its share of all there is."""
-        pairs = (
-            (light[one], light[than]),
-            (light[one] / whole[one], light[than] / whole[than]),
-        )
-        for mine, its in pairs:
+        """Whether a link fits better than another: by the light that it explains, or its share of all."""
+        for mine, its in (
+            (light[link], light[other]),
+            (light[link] / total[link], light[other] / total[other]),
+        ):
             if mine > _CLEARLY * its:
                 return True
             if its > _CLEARLY * mine:
                 return False
-        return len(self._links[one].codebook.codewords) < len(self._links[than].codebook.codewords)
+        return len(self._links[link].codebook.codewords) < len(self._links[other].codebook.codewords)
 
-    def _overlap(self, one: Shown, other: Shown) -> bool:
-        """Whether two packets were in one place at one time: by their frames that are nearest in time."""
-        if max(other.from_us - one.until_us, one.from_us - other.until_us) > 0:
+    def _packets_overlap(self, one: PacketCandidate, other: PacketCandidate) -> bool:
+        """Whether two packets were in one place at one time, by their frames that are nearest in time."""
+        if max(other.start_us - one.end_us, one.start_us - other.end_us) > 0:
             return False
         a, b = min(
             ((a, b) for a in one.packet.frames for b in other.packet.frames),
             key=lambda pair: abs(pair[0].t_us - pair[1].t_us),
         )
-        here = _grown(replace_fields(one.place, x_px=a.x_px, y_px=a.y_px), self._gap_px)
-        there = _grown(replace_fields(other.place, x_px=b.x_px, y_px=b.y_px), self._gap_px)
+        here = _extend_region(replace_fields(one.place, x_px=a.x_px, y_px=a.y_px), self._gap_px)
+        there = _extend_region(replace_fields(other.place, x_px=b.x_px, y_px=b.y_px), self._gap_px)
         return is_same_place(here, there)
 
 
-def _grown(place: Region, by_px: float) -> Region:
-    """A place that is wider and higher."""
+def _extend_region(place: Region, by_px: float) -> Region:
     return replace_fields(place, width_px=place.width_px + by_px, height_px=place.height_px + by_px)
 
 
-class EarlyFrames:
-    """Tells frames in order: those of a transmitter that holds its place at once, others with their packet.
+class FrameReporter:
+    """Reports frames in order: those of a transmitter that owns its place at once, others with their packet.
 
     Args:
-        tell: Gets each frame once; None for nobody.
+        report: Gets each frame once; None for nobody.
 
     Attributes:
-        withdrawn: Frames that were told, of packets that another link took later.
+        withdrawn: Reported frames of packets that another link took later.
     """
 
-    def __init__(self, tell: Callable[[Frame], None] | None) -> None:
-        self._tell = tell
-        # By transmitter, by number of packet and frame; None for one that was told.
-        self._known: OrderedDict[int, OrderedDict[tuple[int, int], Frame | None]] = OrderedDict()
+    def __init__(self, report: Callable[[Frame], None] | None) -> None:
+        self._report = report
+        # By transmitter, then by number of packet and frame; None for a frame that was reported.
+        self._frames: OrderedDict[int, OrderedDict[tuple[int, int], Frame | None]] = OrderedDict()
         self.withdrawn = 0
 
-    def decoded(self, frame: Frame, *, owns: bool) -> None:
-        """Take a frame, in order of its transmitter's, which owns its place now or not."""
-        known = self._known.setdefault(frame.transmitter, OrderedDict())
-        known[frame.packet, frame.frame] = frame
-        if len(known) > _MOST_FRAMES:
-            known.popitem(last=False)
-        self._known.move_to_end(frame.transmitter)
-        if len(self._known) > _MOST_KNOWN:
-            self._known.popitem(last=False)
-        if owns:
-            self._tell_waiting(frame.transmitter)
+    def add_frame(self, frame: Frame, *, owns_place: bool) -> None:
+        """Add the next frame of a transmitter, which owns its place now or not."""
+        frames = self._frames.setdefault(frame.transmitter, OrderedDict())
+        frames[frame.packet, frame.frame] = frame
+        if len(frames) > _MOST_FRAMES:
+            frames.popitem(last=False)
+        self._frames.move_to_end(frame.transmitter)
+        if len(self._frames) > _MOST_TRANSMITTERS:
+            self._frames.popitem(last=False)
+        if owns_place:
+            self._report_waiting(frame.transmitter)
 
-    def given(self, packet: Packet, *, owns: bool) -> None:
-        """Take a packet that is given: tell those of its frames that were not; all that wait if it holds."""
-        if self._tell is None:
+    def accept_packet(self, packet: Packet, *, owns_place: bool) -> None:
+        """Report the rest of a packet's frames; if its transmitter owns its place, all that wait, too."""
+        if self._report is None:
             return
-        told = self._forget(packet)
+        reported = self._forget_packet(packet)
         for frame in packet.frames:
-            if (frame.packet, frame.frame) not in told:
-                self._tell(frame)
-        if owns:
-            self._tell_waiting(packet.transmitter)
+            if (frame.packet, frame.frame) not in reported:
+                self._report(frame)
+        if owns_place:
+            self._report_waiting(packet.transmitter)
 
-    def refused(self, packet: Packet) -> None:
-        """Take a packet that is not given: its frames are not told any more."""
-        self.withdrawn += len(self._forget(packet))
+    def reject_packet(self, packet: Packet) -> None:
+        """Report no more frames of a packet, which belongs to another link."""
+        self.withdrawn += len(self._forget_packet(packet))
 
-    def _tell_waiting(self, number: int) -> None:
-        assert self._tell is not None
-        known = self._known.get(number, OrderedDict())
-        for key, frame in known.items():
+    def _report_waiting(self, number: int) -> None:
+        assert self._report is not None
+        frames = self._frames.get(number, OrderedDict())
+        for key, frame in frames.items():
             if frame is not None:
-                known[key] = None
-                self._tell(frame)
+                frames[key] = None
+                self._report(frame)
 
-    def _forget(self, packet: Packet) -> set[tuple[int, int]]:
-        """Let go what is known of a packet's frames, and of earlier ones; give those of it that were told."""
-        known = self._known.get(packet.transmitter, OrderedDict())
-        over = {key: known.pop(key) for key in list(known) if key[0] <= packet.packet}
-        return {key for key, frame in over.items() if key[0] == packet.packet and frame is None}
+    def _forget_packet(self, packet: Packet) -> set[tuple[int, int]]:
+        """Forget a packet's frames, and those of earlier ones; return which of its frames were reported."""
+        frames = self._frames.get(packet.transmitter, OrderedDict())
+        past = {key: frames.pop(key) for key in list(frames) if key[0] <= packet.packet}
+        return {key for key, frame in past.items() if key[0] == packet.packet and frame is None}
 
 
 def share_detectors(links: Mapping[str, Link]) -> dict[str, BlinkDetector]:

@@ -16,7 +16,7 @@ from evlcp_sdk.air.signing import TrustedKey
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.rx.inbox import MessageAssembler
-from evlcp_sdk.rx.trust import BeaconJudge
+from evlcp_sdk.rx.trust import BeaconVerifier
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
 
 CODER = load_link().block_coder()
@@ -112,7 +112,7 @@ def test_state_is_bounded():
         feed.assembler.add(packet_of(feed.rng.normal(0, 3, 960), 0))
     inboxes = feed.assembler._inboxes
     assert len(inboxes) == 16
-    assert all(len(i.open) <= 8 and len(i.done) <= 8 and len(i.sums) <= 4 for i in inboxes.values())
+    assert all(len(i.incomplete) <= 8 and len(i.complete) <= 8 and len(i.sums) <= 4 for i in inboxes.values())
     feed.assembler.close()
     assert feed.counts["parts_missing"] == 40
 
@@ -292,8 +292,8 @@ def test_every_forgery_is_found_out():
 METRE_DEG = 1 / 111_000
 
 
-def judge_of(*keys, **spec):
-    return BeaconJudge(MessageSpec(trusted_keys=keys, **spec), CODER.digest)
+def verifier_of(*keys, **spec):
+    return BeaconVerifier(MessageSpec(trusted_keys=keys, **spec), CODER.digest)
 
 
 def judge_beacon(now_s=None, *, keys=(), **may):
@@ -301,7 +301,7 @@ def judge_beacon(now_s=None, *, keys=(), **may):
     spec = {name: may.pop(name) for name in ("max_age_s", "revoked_keys", "oldest_sequence") if name in may}
     keys = keys or (TrustedKey(operator().public, **may),)
     message, signature = operator().beacon(SIGNED_S)
-    return judge_of(*keys, **spec).judge(message, PLACE, signature, now_s)
+    return verifier_of(*keys, **spec).verify(message, PLACE, signature, now_s)
 
 
 def area_around(north_m, east_m, radius_m):
@@ -360,8 +360,8 @@ DAY, OLD = {"valid_from": "2026-03-01", "valid_to": "2026-03-02"}, {"max_age_s":
 def test_a_key_is_valid_from_and_to_and_a_beacon_as_old_as_the_receiver_asks_for(may, later_s, why):
     found = judge_beacon(None if later_s is None else SIGNED_S + later_s, **may)
     assert found.trust == ("unverified" if why else "verified")
-    assert found.why.endswith(why)
-    assert found.why.startswith("signed 2026-03-01 12:00:00 UTC" if why else "")
+    assert found.reason.endswith(why)
+    assert found.reason.startswith("signed 2026-03-01 12:00:00 UTC" if why else "")
 
 
 def test_a_revoked_key_signs_nothing():
@@ -369,8 +369,8 @@ def test_a_revoked_key_signs_nothing():
     assert judge_beacon(revoked_keys=(operator().public,)) == revoked
     # Revoked only, and trusted never.
     message, signature = operator().beacon(SIGNED_S)
-    judge = judge_of(revoked_keys=(operator().public,))
-    assert judge.judge(message, PLACE, signature, None) == revoked
+    verifier = verifier_of(revoked_keys=(operator().public,))
+    assert verifier.verify(message, PLACE, signature, None) == revoked
 
 
 @pytest.mark.parametrize(
@@ -387,27 +387,27 @@ def test_a_revoked_key_signs_nothing():
     ],
 )
 def test_an_unsigned_beacon_that_contradicts_a_verified_one_is_forged(change, transmitter_id, signed_by, how):
-    judge, liar = judge_of(*operator().trusted), replace(PLACE, **change)
+    verifier, liar = verifier_of(*operator().trusted), replace(PLACE, **change)
     claim, right = operator().beacon(SIGNED_S + 1, liar, transmitter_id)
     signature = signed_by.sign(claim) if signed_by else None
-    assert judge.judge(claim, liar, signature, None).trust == "unverified"
+    assert verifier.verify(claim, liar, signature, None).trust == "unverified"
     message, good = operator().beacon(SIGNED_S)
-    assert judge.judge(message, PLACE, good, None) == ("verified", "")
-    found = judge.judge(claim, liar, signature, None)
+    assert verifier.verify(message, PLACE, good, None) == ("verified", "")
+    found = verifier.verify(claim, liar, signature, None)
     assert found.trust == ("forged" if how else "unverified")
-    assert how in found.why
+    assert how in found.reason
     # With a signature it is a bar that was moved, or a second one.
-    assert judge.judge(claim, liar, right, None) == ("verified", "")
+    assert verifier.verify(claim, liar, right, None) == ("verified", "")
 
 
 def test_an_old_beacon_is_replayed():
     reason = f"replayed: sequence {SIGNED_S} is older than messages.oldest_sequence {SIGNED_S + 1}"
     assert judge_beacon(oldest_sequence=SIGNED_S + 1) == ("forged", reason)
-    judge = judge_of(*operator().trusted)
+    verifier = verifier_of(*operator().trusted)
 
     def shown(sequence, place, transmitter_id=7):
         message, signature = operator().beacon(sequence, place, transmitter_id)
-        return judge.judge(message, place, signature, None)
+        return verifier.verify(message, place, signature, None)
 
     assert shown(9, PLACE).trust == "verified"
     elsewhere = replace(PLACE, latitude_deg=35.3)

@@ -36,7 +36,7 @@ def fail(view):
 def test_the_same_whoever_decodes(monkeypatch):
     """Frames, counts and order, of two links, where memory for events is short."""
     links = [LINK, replace(load_link(overrides=["modulation.id=wh8"]), name="wh8")]
-    monkeypatch.setattr(workers, "_ROOM_BYTES", 1 << 20)
+    monkeypatch.setattr(workers, "_MEMORY_BYTES", 1 << 20)
     for link in (LINK, links):
         outcomes = []
         for many in (1, 3):
