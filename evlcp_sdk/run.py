@@ -319,7 +319,7 @@ def live(
     """
     from evlcp_sdk.live.loop import LiveLoop
     from evlcp_sdk.live.publisher import Publisher
-    from evlcp_sdk.live.warm import warm_up
+    from evlcp_sdk.live.warm import load_kernels
 
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
@@ -328,7 +328,7 @@ def live(
         # A recording waits for its reader, and what is wrong with its name is said at once.
         waits = not isinstance(source, EventSource) and is_recording(source)
         if warm and not waits:
-            warm_up(links, positions=plan is not None)
+            load_kernels(links, positions=plan is not None)
         opened = open_until_stopped(source, registry, stopped)
         if not opened.live and opened.size_bytes is not None:
             opened = ReplaySource(opened)
@@ -336,7 +336,7 @@ def live(
             url = _name_of(source, opened)
             check_sensor(opened, url, links[0].camera)
             if warm and waits:
-                warm_up(links, positions=plan is not None)
+                load_kernels(links, positions=plan is not None)
             loop: LiveLoop
             with ResultWriter(
                 folder,
@@ -348,14 +348,14 @@ def live(
                 clock_zero=clock_zero,
                 sinks=sinks,
                 lines=lines,
-                on_fix=lambda placed: loop.placed(placed),
+                on_fix=lambda placed: loop.publish_fix(placed),
             ) as writer:
                 receiver = Receiver(
                     links,
                     registry.hook,
                     attitude=attitude,
                     clock_zero=clock_zero,
-                    on_frame=lambda frame: loop.frame(frame),
+                    on_frame=lambda frame: loop.publish_frame(frame),
                     workers=workers,
                 )
                 pulses = clock_zero if isinstance(clock_zero, PulseClock) else None

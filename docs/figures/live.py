@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 
 from evlcp_sdk.link.several import load_links, name_links
 from evlcp_sdk.live import Budget, Publisher
-from evlcp_sdk.live.services import Serving, serve
+from evlcp_sdk.live.services import ServiceOptions, serve
 from evlcp_sdk.place.navigator import PositionPlan
 from evlcp_sdk.run import live
 from evlcp_sdk.scene.attitude import AttitudeLog
@@ -38,7 +38,7 @@ def main() -> None:
 
     links, publisher, sites = load_links(None), Publisher(), load_sites(given.sites)
     attitude = AttitudeLog.read(given.attitude)
-    serving = Serving(view=True)
+    serving = ServiceOptions(view=True)
     over = threading.Event()
     with (
         TemporaryDirectory() as folder,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.live.loop import LiveStatus
     from evlcp_sdk.live.publisher import Publisher
-    from evlcp_sdk.live.services import Serving
+    from evlcp_sdk.live.services import ServiceOptions
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.plugin.source import EventSource
@@ -70,9 +70,9 @@ class ServingOptions:
         typer.Option("--gpsd-port", min=0, max=65535, metavar="PORT", help="Serve positions as gpsd does."),
     ] = None
 
-    def chosen(self, out: Path | None, *, positions: bool) -> Serving:
+    def chosen(self, out: Path | None, *, positions: bool) -> ServiceOptions:
         """What to serve; recordings go into `out`, or this folder."""
-        from evlcp_sdk.live.services import Serving
+        from evlcp_sdk.live.services import ServiceOptions
 
         for name, port in (("--nmea-port", self.nmea_port), ("--gpsd-port", self.gpsd_port)):
             if port is not None and not positions:
@@ -84,7 +84,7 @@ class ServingOptions:
         ):
             if changed and not self.view:
                 raise typer.BadParameter("needs --view", param_hint=name)
-        return Serving(
+        return ServiceOptions(
             self.view,
             self.view_host,
             self.view_port,
@@ -167,7 +167,7 @@ def live(
 
 @contextmanager
 def _served(
-    chosen: Serving,
+    chosen: ServiceOptions,
     publisher: Publisher,
     links: Sequence[Link],
     url: str,
@@ -227,7 +227,7 @@ def _going_on(publisher: Publisher, *, silent: bool) -> Iterator[None]:
     try:
         yield
     finally:
-        publisher.leave(mine)
+        publisher.unsubscribe(mine)
         thread.join()
 
 

@@ -5,8 +5,8 @@ source --reader (a thread)--> slices --LiveLoop--> receiver --> Publisher --> Su
                                                      +-> PictureSlot (drawn when asked for, the newest only)
 ```
 
-How a viewer, a server or a recorder listens, from threads of its own, is in `docs/live.md`. A picture is
-drawn for whoever asks: `publisher.pictures.take(timeout_s=0.5)`. What is published:
+How a viewer, a server or a recorder subscribes, from threads of its own, is in `docs/live.md`. A picture is
+drawn on request: `publisher.pictures.wait(timeout_s=0.5)`. What is published:
 
 | kind | value | when |
 |---|---|---|

@@ -1,4 +1,4 @@
-"""Real time as a budget: what is left out, in which order, when the receiver cannot keep up."""
+"""Load shedding: what is left out, in which order, when the receiver cannot keep up."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ LEVELS: Final = (
     "and all outside of regions",
     "and the oldest slices whole",
 )
-"""What each level of shedding says."""
+"""The levels of shedding, in words."""
 
 RANGING_EVERY: Final = 4
-"""From the second level on, distances are measured of every so manyth frame."""
+"""From the second level on, distances are measured of one frame of so many."""
 
 _MARGIN_PX: Final = 16
-"""Around a region, which moves, and may be less than its bar."""
+"""Around a region, which moves, and may be smaller than its bar."""
 
-_SWEEP_US: Final = 100_000
-_WHOLE_US: Final = 20_000
-"""At the first levels, so much of each `_SWEEP_US` is left whole, in which new bars are found."""
+_SEARCH_PERIOD_US: Final = 100_000
+_SEARCH_US: Final = 20_000
+"""At the first levels, so much of each period is not shed, so that new bars are found."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Budget:
     """How long slices may wait before something is shed.
 
     Attributes:
-        waiting_ms: Of the oldest slice that waits, from which on rows outside of regions are shed; from twice
-            that on distances, from four times on all outside of regions.
-        most_ms: The same from which on the oldest slices are dropped whole: no result is later by more.
+        waiting_ms: Wait of the oldest slice from which on rows outside of regions are shed; from twice that
+            on distances are, from four times on all outside of regions.
+        most_ms: Wait from which on the oldest slices are dropped whole: no result is later by more.
 
     Raises:
         ConfigError: A value is not positive, or `most_ms` is less than four times `waiting_ms`.
@@ -53,28 +53,28 @@ class Budget:
                 " positive, the most at least four times the first"
             )
 
-    def level(self, waiting_ms: float, before: int) -> int:
-        """The level of shedding for how long the oldest slice waits; it falls only at half of what raised it.
+    def choose_level(self, waiting_ms: float, previous: int) -> int:
+        """The level for the wait of the oldest slice; it falls only at half of the limit that raised it.
 
-        >>> [Budget().level(ms, 0) for ms in (1, 25, 45, 90, 300)], Budget().level(25, 2)
+        >>> [Budget().choose_level(ms, 0) for ms in (1, 25, 45, 90, 300)], Budget().choose_level(25, 2)
         ([0, 1, 2, 3, 4], 2)
         """
         limits_ms = (self.waiting_ms, 2 * self.waiting_ms, 4 * self.waiting_ms, self.most_ms)
         level = sum(waiting_ms > limit_ms for limit_ms in limits_ms)
-        while level < before and waiting_ms > limits_ms[level] / 2:
+        while level < previous and waiting_ms > limits_ms[level] / 2:
             level += 1
         return level
 
 
 class Shedder:
-    """Leaves events out, as a level says, and counts them.
+    """Leaves events out by the level of shedding, and counts them.
 
     Args:
         width: Columns of the sensor.
         height: Its rows.
 
     Attributes:
-        counts: Events left out so far: of `rows_outside_regions`, of `empty_areas`, and `too_late`.
+        counts: Events left out: of `rows_outside_regions`, of `empty_areas`, and `too_late`.
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -82,16 +82,16 @@ class Shedder:
         self.counts = {"rows_outside_regions": 0, "empty_areas": 0, "too_late": 0}
 
     def shed(self, events: Events, level: int, regions: Sequence[Region]) -> Events:
-        """The events that are left; all where there is no region, as one must be found first."""
+        """The remaining events; all of them without a region, as one must be found first."""
         if not level or not regions or not len(events):
             return events
         rows_only = level < 3
-        if rows_only and int(events.t_us[0]) % _SWEEP_US < _WHOLE_US:
+        if rows_only and int(events.t_us[0]) % _SEARCH_PERIOD_US < _SEARCH_US:
             return events
         kept = np.zeros(len(events), np.bool_)
         for region in regions:
-            left, right = _reach(region.x_px, region.width_px, self._size[0])
-            top, bottom = _reach(region.y_px, region.height_px, self._size[1])
+            left, right = _extend(region.x_px, region.width_px, self._size[0])
+            top, bottom = _extend(region.y_px, region.height_px, self._size[1])
             kept |= mask_inside(
                 events, (0, top, self._size[0], bottom) if rows_only else (left, top, right, bottom)
             )
@@ -99,12 +99,12 @@ class Shedder:
         self.counts[name] += len(events) - int(np.count_nonzero(kept))
         return events[kept]
 
-    def drop(self, events: Events) -> None:
-        """Count events that are dropped whole."""
+    def count_dropped(self, events: Events) -> None:
+        """Count the events of a dropped slice."""
         self.counts["too_late"] += len(events)
 
 
-def _reach(centre_px: float, size_px: float, most: int) -> tuple[int, int]:
-    """First and last but one row or column of a region, with its margin."""
+def _extend(centre_px: float, size_px: float, limit: int) -> tuple[int, int]:
+    """First row or column of a region with its margin, and the one after its last."""
     first, last = centre_px - size_px / 2 - _MARGIN_PX, centre_px + size_px / 2 + _MARGIN_PX + 1
-    return min(max(int(first), 0), most), min(max(int(last), 0), most)
+    return min(max(int(first), 0), limit), min(max(int(last), 0), limit)

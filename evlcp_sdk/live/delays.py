@@ -1,4 +1,4 @@
-"""How long results take, as quantiles in constant memory."""
+"""Quantiles of the delays of results, in constant memory."""
 
 import math
 from collections import Counter
@@ -6,14 +6,14 @@ from typing import Final
 
 _RANGE_MS: Final = (1e-3, 1e6)
 _CELLS_PER_E: Final = 50
-"""Cells a factor of e: 2 % each."""
+"""Of 2 % each, for a factor of e."""
 
 
 class DelayTally:
     """Delays counted in cells of 2 %, from 1 us to a million ms.
 
     Attributes:
-        count: How many there were.
+        count: Number of delays.
         max_ms: The longest, ms; 0 before the first.
 
     >>> tally = DelayTally()
@@ -29,13 +29,13 @@ class DelayTally:
         self._cells = Counter[int]()
 
     def add(self, delay_ms: float) -> None:
-        """Count a delay; one that is not positive counts as the shortest."""
+        """Add a delay; one that is not positive counts as the shortest."""
         self.count += 1
         self.max_ms = max(self.max_ms, delay_ms)
         self._cells[math.ceil(math.log(min(max(delay_ms, _RANGE_MS[0]), _RANGE_MS[1])) * _CELLS_PER_E)] += 1
 
     def quantile_ms(self, share: float) -> float:
-        """The delay that this share of all does not exceed, ms, to 2 %; NaN where there are none."""
+        """The delay that this share of all does not exceed, ms, to 2 %; NaN where there is none."""
         if not self.count:
             return math.nan
         left = math.ceil(share * self.count)

@@ -21,39 +21,39 @@ from evlcp_sdk.utc import PulseClock
 from evlcp_sdk.values import Events, Frame, Packet, ReceivedMessage, Region, span_us
 
 STAGES: Final = ("gather", "queue", "compute", "total")
-"""Of a frame's delay: from its last chip until the slice with which it could be decoded was there; until that
-was taken; until the frame was decoded; and all of these."""
+"""Stages of a frame's delay: from its last chip to the arrival of the slice that completes it; to its
+processing; to the decoded frame; and the sum of these."""
 
-_END_TO_END: Final = "end_to_end"
-"""Of a message `time`: from what its transmitter says, when its first chip shines, until it was read."""
+_END_TO_END_STAGE: Final = "end_to_end"
+"""Of a message `time`: from its content, the time of its first chip, until it was read."""
 
 _STATUS_EVERY_S: Final = 0.2
 _IDLE_S: Final = 0.05
-_TURN_EVENTS: Final = 1 << 16
-_TURN_US: Final = 8_000
-"""How much is taken at once where slices wait."""
-_WAITED_S: Final = 1e-3
-"""How long one has waited before those behind it are taken with it: a slice of a camera that keeps up."""
+_MAX_BATCH_EVENTS: Final = 1 << 16
+_MAX_BATCH_US: Final = 8_000
+"""Largest batch of waiting slices."""
+_BATCH_AFTER_S: Final = 1e-3
+"""Time that a slice has waited when later ones join its batch: a slice of a camera that keeps up."""
 
 
 @dataclass(frozen=True, eq=False)
 class LiveStatus:
-    """How a live run goes.
+    """The state of a live run.
 
     Attributes:
         t_us: Newest event, camera clock, us.
-        elapsed_s: Since the start, s.
-        events: Events so far, those shed too.
-        events_per_s: In the time since the last status.
-        level: What is shed, a number of `LEVELS`.
+        elapsed_s: Time since the start, s.
+        events: Number of events, with those shed.
+        events_per_s: Event rate since the last status.
+        level: Level of shedding, an index of `LEVELS`.
         shed: Events left out so far, by reason, and frames without a distance.
-        delays: Of all frames so far, by stage, and of messages `time` from end to end: count, p50, p99 and
+        delays: Delays of all frames, by stage, and of messages `time` from end to end: count, p50, p99 and
             maximum, ms.
         recent: The same since the last status.
-        counts: As of the receiver.
-        losses: As of the source.
-        regions: The regions that are followed.
-        health: What the camera says of itself.
+        counts: The receiver's counts.
+        losses: The source's losses.
+        regions: The receiver's regions.
+        health: The camera's report of itself.
     """
 
     t_us: float
@@ -71,18 +71,18 @@ class LiveStatus:
 
 
 class LiveLoop:
-    """Reads a source in real time, feeds the receiver, and tells listeners what it finds.
+    """Reads a source in real time, feeds the receiver, and publishes the results.
 
     Args:
-        source: What is read; not closed.
-        receiver: What decodes it; it gives each frame to `frame`.
-        links: What it decodes.
-        publisher: Where results and pictures go.
-        budget: When what is shed.
-        pulses: Is told of triggers, which say the UTC of the camera's clock; None for nobody.
+        source: The source; not closed.
+        receiver: The receiver; it passes each frame to `publish_frame`.
+        links: Its links.
+        publisher: Takes results and pictures.
+        budget: When to shed what.
+        pulses: Takes triggers, which give the UTC of the camera's clock; None for none.
 
     Attributes:
-        delays: Of frames, by stage; `end_to_end` of messages `time`.
+        delays: Delays of frames, by stage; `end_to_end` of messages `time`.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class LiveLoop:
         self._reader = Reader(source)
         self._size = source.width or 1280, source.height or 720
         self._shedder = Shedder(*self._size)
-        self.delays = {stage: DelayTally() for stage in (*STAGES, _END_TO_END)}
+        self.delays = {stage: DelayTally() for stage in (*STAGES, _END_TO_END_STAGE)}
         self._recent = {stage: DelayTally() for stage in self.delays}
         self._level = 0
         self._levels_s = [0.0] * len(LEVELS)
@@ -112,10 +112,9 @@ class LiveLoop:
         self._status_events = 0
 
     def run(self, stopped: Stopped) -> Iterator[tuple[Events, list[Packet]]]:
-        """Yield what is received: the events that the receiver got, and its packets.
+        """Yield the receiver's events and its packets, batch by batch, after publishing its results.
 
-        The listeners have had the frames, packets and messages by then. Ends where the source ends, or when
-        `stopped`; what waits then is still received where the source has ended.
+        Ends with the source, all of which is received, or when `stopped`.
 
         Raises:
             InputError: The source cannot be read on.
@@ -128,8 +127,8 @@ class LiveLoop:
                 if piece is None and self._reader.ended:
                     break
                 if piece is not None:
-                    yield self._turn(piece)
-                self._tell_status()
+                    yield self._process(piece)
+                self._publish_status()
         finally:
             self._reader.stop()
         if self._reader.fault is not None and not stopped():
@@ -139,35 +138,35 @@ class LiveLoop:
         """End the stream; return the packets that were still incomplete."""
         self._arrived_s = self._taken_s = float("nan")
         packets = self._receiver.close()
-        self._tell(packets)
-        self._tell_status(now=True)
+        self._publish_packets(packets)
+        self._publish_status(now=True)
         return packets
 
-    def frame(self, frame: Frame) -> None:
-        """Tell listeners of a frame, and count how long it took."""
+    def publish_frame(self, frame: Frame) -> None:
+        """Publish a frame, and count its delay."""
         now = time.monotonic()
         form = self._forms[frame.link]
         chips = form.frame_chips if form.has_pilot(frame.frame) else form.info_chips
-        shone_s = self._shone_s(frame.t_us + chips * form.chip_us)
+        light_s = self._light_time_s(frame.t_us + chips * form.chip_us)
         late_ms = None
-        if self._arrived_s == self._arrived_s:  # not at the end, whose time says nothing
-            parts_s = self._arrived_s - shone_s, self._taken_s - self._arrived_s, now - self._taken_s
-            late_ms = (now - shone_s) * 1e3
-            for stage, part_s in zip(STAGES, (*parts_s, now - shone_s), strict=True):
-                self._count(stage, part_s * 1e3)
+        if self._arrived_s == self._arrived_s:  # not at the end, which has no delay
+            parts_s = self._arrived_s - light_s, self._taken_s - self._arrived_s, now - self._taken_s
+            late_ms = (now - light_s) * 1e3
+            for stage, part_s in zip(STAGES, (*parts_s, now - light_s), strict=True):
+                self._count_delay(stage, part_s * 1e3)
         self._publisher.publish("frame", frame.t_us, frame, late_ms)
 
-    def _shone_s(self, t_us: float) -> float:
-        """When a time of the camera's clock was, by our own clock, s."""
-        shone_s = self._source.clock_s(t_us)
-        return self._reader.arrivals.at_s(t_us) if shone_s is None else shone_s
+    def _light_time_s(self, t_us: float) -> float:
+        """A time of the camera's clock on the host's, s."""
+        host_s = self._source.clock_s(t_us)
+        return self._reader.arrivals.to_host_s(t_us) if host_s is None else host_s
 
-    def placed(self, placed: Placed) -> None:
-        """Tell listeners of a fix."""
+    def publish_fix(self, placed: Placed) -> None:
+        """Publish a fix."""
         self._publisher.publish("fix", placed.fix.t_us, placed)
 
     def summary(self) -> dict[str, Any]:
-        """Delays by stage, what was shed, and for how long, as JSON values."""
+        """Delays by stage, what was shed, and the time at each level, as JSON values."""
         return {
             "delays": {stage: tally.to_dict() for stage, tally in self.delays.items()},
             "shed": self.shed,
@@ -183,28 +182,28 @@ class LiveLoop:
         counts["too_late"] += self._reader.dropped
         return counts | {"frames_not_ranged": self._receiver.counts.get("frames_not_ranged", 0)}
 
-    def _turn(self, piece: Slice) -> tuple[Events, list[Packet]]:
-        """Take a slice, and those that wait behind it, as far as they are few."""
+    def _process(self, piece: Slice) -> tuple[Events, list[Packet]]:
+        """Receive a slice, and a batch of those that wait behind it."""
         taken_s = time.monotonic()
         self._levels_s[self._level] += taken_s - self._taken_s
-        self._level = self._budget.level((taken_s - piece.arrived_s) * 1e3, self._level)
+        self._level = self._budget.choose_level((taken_s - piece.arrived_s) * 1e3, self._level)
         pieces = [piece]
         while self._level == len(LEVELS) - 1 and taken_s - piece.arrived_s > self._budget.waiting_ms * 1e-3:
-            # All but the newest is too late.
+            # All but the newest are too late.
             newer = self._reader.take(0.0)
             if newer is None:
                 break
             self._publish_raw(piece)
-            self._shedder.drop(piece.events)
+            self._shedder.count_dropped(piece.events)
             piece, pieces = newer, [newer]
         events = len(piece.events)
-        while events < _TURN_EVENTS and taken_s - piece.arrived_s > _WAITED_S:
+        while events < _MAX_BATCH_EVENTS and taken_s - piece.arrived_s > _BATCH_AFTER_S:
             more = self._reader.take(0.0)
             if more is None:
                 break
             pieces.append(more)
             events += len(more.events)
-            if _span_us(pieces) > _TURN_US:
+            if _span_us(pieces) > _MAX_BATCH_US:
                 break
         self._arrived_s, self._taken_s = pieces[-1].arrived_s, taken_s
         regions = self._receiver.regions
@@ -212,55 +211,55 @@ class LiveLoop:
         for one in pieces:
             self._publish_raw(one)
             self._publisher.pictures.add(one.events, *self._size, regions)
-        whole = pieces[0].events if len(pieces) == 1 else Events.concat(one.events for one in pieces)
-        if len(whole):
-            self._last_us = float(whole.t_us[-1])
-        kept = self._shedder.shed(whole, self._level, regions)
+        batch = pieces[0].events if len(pieces) == 1 else Events.concat(one.events for one in pieces)
+        if len(batch):
+            self._last_us = float(batch.t_us[-1])
+        kept = self._shedder.shed(batch, self._level, regions)
         packets = self._receiver.feed(kept)
-        self._tell(packets)
+        self._publish_packets(packets)
         return kept, packets
 
     def _publish_raw(self, piece: Slice) -> None:
         if self._pulses is not None:
-            came_s = time.time() - time.monotonic() + piece.arrived_s
-            self._pulses.add(piece.triggers, came_s, span_us(piece.events, piece.triggers)[1])
+            arrived_s = time.time() - time.monotonic() + piece.arrived_s
+            self._pulses.add(piece.triggers, arrived_s, span_us(piece.events, piece.triggers)[1])
         self._events += len(piece.events)
         if len(piece.triggers):
             self._publisher.publish("triggers", float(piece.triggers.t_us[0]), piece.triggers)
         if len(piece.events):
             self._publisher.publish("events", float(piece.events.t_us[0]), piece.events)
 
-    def _tell(self, packets: list[Packet]) -> None:
+    def _publish_packets(self, packets: list[Packet]) -> None:
         for packet in packets:
             self._publisher.publish("packet", packet.t_us, packet)
             for message in packet.messages:
                 self._publisher.publish("message", packet.t_us, message, self._end_to_end_ms(message))
 
     def _end_to_end_ms(self, message: ReceivedMessage) -> float | None:
-        """How long after the time that it says a message `time` is read, ms; None for others, or at the end.
+        """Delay of a message `time` after the time in it, ms; None for others, or at the end.
 
-        By the camera's UTC where that is known; else by the computer's, of a source that is not a replay.
+        By the camera's UTC where that is known; else by the computer's, if the source is no replay.
         """
         if message.message.kind != Kind.TIME or self._arrived_s != self._arrived_s:
             return None
         if message.age_s is not None:
-            late_ms = (message.age_s + time.monotonic() - self._shone_s(message.t_us)) * 1e3
+            late_ms = (message.age_s + time.monotonic() - self._light_time_s(message.t_us)) * 1e3
         elif self._source.clock_s(message.t_us) is None and self._source.live:
             late_ms = (time.time() - message.value) * 1e3
         else:
             return None
-        self._count(_END_TO_END, late_ms)
+        self._count_delay(_END_TO_END_STAGE, late_ms)
         return late_ms
 
-    def _count(self, stage: str, delay_ms: float) -> None:
+    def _count_delay(self, stage: str, delay_ms: float) -> None:
         self.delays[stage].add(delay_ms)
         self._recent[stage].add(delay_ms)
 
-    def _tell_status(self, *, now: bool = False) -> None:
-        """Say how it goes, where it is time for that."""
+    def _publish_status(self, *, now: bool = False) -> None:
+        """Publish the status where it is due."""
         at_s = time.monotonic()
         since_s = at_s - self._status_s
-        if (since_s < _STATUS_EVERY_S and not now) or not self._publisher.wanted("status"):
+        if (since_s < _STATUS_EVERY_S and not now) or not self._publisher.has_listeners("status"):
             return
         status = LiveStatus(
             t_us=self._last_us,
@@ -283,5 +282,5 @@ class LiveLoop:
 
 def _span_us(pieces: list[Slice]) -> int:
     """From the first event of some slices to their last, us."""
-    some = [one.events.t_us for one in pieces if len(one.events)]
-    return int(some[-1][-1] - some[0][0]) if some else 0
+    times_us = [one.events.t_us for one in pieces if len(one.events)]
+    return int(times_us[-1][-1] - times_us[0][0]) if times_us else 0

@@ -1,4 +1,4 @@
-"""What a live run finds, given to whoever listens, without ever waiting for them."""
+"""Publishes the results of a live run to subscribers, without ever waiting for them."""
 
 import threading
 from collections import deque
@@ -10,19 +10,19 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.live.pictures import PictureSlot
 
 KINDS: Final = ("frame", "packet", "message", "fix", "events", "triggers", "status", "end")
-"""What is published; see `evlcp_sdk.live`."""
+"""Kinds of news; see `evlcp_sdk.live`."""
 
 
 @dataclass(frozen=True, eq=False)
 class News:
-    """One thing that a live run found.
+    """One result of a live run.
 
     Attributes:
         kind: One of `KINDS`.
         t_us: Its time on the camera's clock, us.
-        value: What it is.
-        late_ms: Of a frame, how long after its last chip it was there, ms; of a message `time`, how long
-            after what it says. None where that is not known.
+        value: The result.
+        late_ms: Delay of a frame after its last chip, ms; of a message `time` after its content. None where
+            it is not known.
     """
 
     kind: str
@@ -32,10 +32,11 @@ class News:
 
 
 class Subscription:
-    """A queue of news, the newest `most`; made by `Publisher.subscribe`.
+    """A queue of the newest `most` news, made by `Publisher.subscribe`.
 
     Attributes:
-        dropped: News that were pushed out of the queue by newer ones, so far.
+        kinds: Kinds of its news.
+        dropped: Number of news that newer ones have pushed out of the queue.
     """
 
     def __init__(self, kinds: frozenset[str], most: int, wake: Callable[[], None] | None) -> None:
@@ -49,14 +50,14 @@ class Subscription:
 
     @property
     def ended(self) -> bool:
-        """Nothing more will come, and nothing is left."""
+        """Whether nothing more will come, and nothing is left."""
         return self._over and not self._queue
 
     def take(self, timeout_s: float | None = None) -> list[News]:
-        """Return all that has come, oldest first; waits for something.
+        """Remove and return all news, oldest first; wait for some.
 
         Args:
-            timeout_s: How long at the most, s; 0 not at all, None for as long as something may come.
+            timeout_s: Longest wait, s; 0 for none, None until something comes or the subscription ends.
         """
         with self._filled:
             if not self._queue and not self._over and timeout_s != 0:
@@ -65,7 +66,7 @@ class Subscription:
         return taken
 
     def put(self, news: News) -> None:
-        """Take one thing; of a queue that is full the oldest goes."""
+        """Add news; a full queue drops the oldest."""
         with self._filled:
             if self._over:
                 return
@@ -78,7 +79,7 @@ class Subscription:
             self._wake()
 
     def close(self) -> None:
-        """Take nothing more; what is there can still be taken."""
+        """End the queue; what is in it can still be taken."""
         with self._filled:
             self._over = True
             self._filled.notify_all()
@@ -87,10 +88,10 @@ class Subscription:
 
 
 class Publisher:
-    """Gives what a live run finds to its subscriptions; any thread may subscribe, at any time.
+    """Passes the results of a live run to subscriptions; any thread may subscribe, at any time.
 
     Attributes:
-        pictures: Where a picture of events is drawn when it is asked for.
+        pictures: Draws pictures of events on request.
 
     >>> publisher = Publisher()
     >>> mine = publisher.subscribe({"status"}, most=2)
@@ -109,12 +110,12 @@ class Publisher:
     def subscribe(
         self, kinds: Collection[str] = KINDS, *, most: int = 1000, wake: Callable[[], None] | None = None
     ) -> Subscription:
-        """Return a queue that news come to from now on.
+        """Return a queue for the news from now on.
 
         Args:
-            kinds: Which.
-            most: How many wait at the most; beyond that the oldest go, counted.
-            wake: Called when something has come, in the thread that published it; must not wait.
+            kinds: Kinds of news.
+            most: Longest queue; beyond that the oldest are dropped, counted.
+            wake: Called after each, in the thread that published it; must not wait.
 
         Raises:
             StreamError: A kind is not one of `KINDS`, or `most` is not positive.
@@ -123,26 +124,26 @@ class Publisher:
             raise StreamError(f"news of kind {sorted(unknown)[0]!r}, expected {', '.join(KINDS)}")
         if most < 1:
             raise StreamError(f"a queue of {most} news, expected 1 or more")
-        mine = Subscription(frozenset(kinds), most, wake)
+        subscription = Subscription(frozenset(kinds), most, wake)
         with self._lock:
             if self._closed:
-                mine.close()
+                subscription.close()
             else:
-                self._all = (*self._all, mine)
-        return mine
+                self._all = (*self._all, subscription)
+        return subscription
 
-    def leave(self, subscription: Subscription) -> None:
-        """Let a subscription go; twice does no harm."""
+    def unsubscribe(self, subscription: Subscription) -> None:
+        """End a subscription; twice does no harm."""
         with self._lock:
             self._all = tuple(one for one in self._all if one is not subscription)
         subscription.close()
 
-    def wanted(self, kind: str) -> bool:
-        """Whether somebody listens to a kind."""
+    def has_listeners(self, kind: str) -> bool:
+        """Whether there are subscriptions to a kind."""
         return any(kind in one.kinds for one in self._all)
 
     def publish(self, kind: str, t_us: float, value: Any, late_ms: float | None = None) -> None:
-        """Give something to all who listen to its kind."""
+        """Pass a result to all subscriptions to its kind."""
         listeners = [one for one in self._all if kind in one.kinds]
         if not listeners:
             return
@@ -151,10 +152,10 @@ class Publisher:
             one.put(news)
 
     def close(self) -> None:
-        """End all subscriptions, of which what waits can still be taken, and pictures."""
+        """End all subscriptions and pictures; waiting news can still be taken."""
         with self._lock:
             self._closed = True
-            everyone, self._all = self._all, ()
-        for one in everyone:
+            subscriptions, self._all = self._all, ()
+        for one in subscriptions:
             one.close()
         self.pictures.close()

@@ -1,4 +1,4 @@
-"""A recording of what comes, started and stopped while a run goes on."""
+"""Records events and triggers, started and stopped during a run."""
 
 import shutil
 import threading
@@ -12,20 +12,20 @@ from evlcp_sdk.live.publisher import Publisher, Subscription
 from evlcp_sdk.plugin.writer import EventWriter
 from evlcp_sdk.values import Events, Triggers
 
-_MOST_WAITING: Final = 4096
-"""Pieces that wait for the disk, some seconds; the oldest go, counted."""
+_MAX_WAITING: Final = 4096
+"""Pieces that may wait for the disk, some seconds; beyond, the oldest are dropped."""
 
-_LEAST_FREE: Final = 100_000_000
-"""Bytes of the disk below which a recording ends, while it can still be completed: some seconds of a camera,
-and what the result of the run needs."""
+_MIN_FREE_BYTES: Final = 100_000_000
+"""Free bytes on the disk below which a recording ends: enough for some seconds of a camera, and the result
+of the run."""
 
 
 class Recorder:
     """Writes events and triggers to a RAW file in a thread of its own, from `start` to `stop`.
 
     Args:
-        publisher: Where they come from.
-        folder: Where files go, named by the time of their start; made if need be.
+        publisher: Gives the events and triggers.
+        folder: Folder of the files, which are named by their start; created if need be.
         width: Columns of the sensor.
         height: Its rows.
     """
@@ -33,7 +33,7 @@ class Recorder:
     def __init__(self, publisher: Publisher, folder: Path, width: int, height: int) -> None:
         self._publisher, self._folder = publisher, folder
         self._size = width, height
-        self._mine: Subscription | None = None
+        self._subscription: Subscription | None = None
         self._thread: threading.Thread | None = None
         self._path: Path | None = None
         self._events = 0
@@ -41,31 +41,31 @@ class Recorder:
 
     @property
     def state(self) -> dict[str, Any]:
-        """Whether it records, the file, the events in it, pieces that were dropped, and what went wrong."""
+        """Whether it records, the file, its events, dropped pieces, and the fault that ended it."""
         return {
             "recording": self._thread is not None and self._thread.is_alive(),
             "file": None if self._path is None else self._path.name,
             "events": self._events,
-            "dropped": 0 if self._mine is None else self._mine.dropped,
+            "dropped": 0 if self._subscription is None else self._subscription.dropped,
             "fault": self._fault,
         }
 
     def start(self) -> None:
-        """Begin a file; nothing where one is being written."""
+        """Start a file, if none is being written."""
         if self.state["recording"]:
             return
         self._path = self._folder / f"live-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}.raw"
         self._events, self._fault = 0, ""
-        self._mine = self._publisher.subscribe({"events", "triggers"}, most=_MOST_WAITING)
+        self._subscription = self._publisher.subscribe({"events", "triggers"}, most=_MAX_WAITING)
         self._thread = threading.Thread(
-            target=self._write, args=(self._path, self._mine), name="evlcp-recorder", daemon=True
+            target=self._write, args=(self._path, self._subscription), name="evlcp-recorder", daemon=True
         )
         self._thread.start()
 
     def stop(self) -> None:
-        """End the file, which is there once all that has come is in it."""
-        if self._mine is not None:
-            self._publisher.leave(self._mine)
+        """End the file, which is complete when its thread ends."""
+        if self._subscription is not None:
+            self._publisher.unsubscribe(self._subscription)
 
     def close(self) -> None:
         """End the file, and wait for it."""
@@ -73,38 +73,38 @@ class Recorder:
         if self._thread is not None:
             self._thread.join(30.0)
 
-    def _write(self, path: Path, mine: Subscription) -> None:
+    def _write(self, path: Path, subscription: Subscription) -> None:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with open_writer(path, *self._size) as writer:
-                self._fill(writer, mine)
+                self._write_news(writer, subscription)
         except EvlcpError as fault:
             self._fault = str(fault)
         except OSError as fault:
             self._fault = f"{path.parent}: cannot be made: {fault.strerror}"
         finally:
-            self._publisher.leave(mine)
+            self._publisher.unsubscribe(subscription)
 
-    def _fill(self, writer: EventWriter, mine: Subscription) -> None:
-        """Write what comes; what is written stays where no more can be."""
-        held = Triggers.empty()
-        while not mine.ended:
-            for news in mine.take(0.5):
+    def _write_news(self, writer: EventWriter, subscription: Subscription) -> None:
+        """Write news until the subscription ends or writing fails; what is written stays."""
+        triggers = Triggers.empty()
+        while not subscription.ended:
+            for news in subscription.take(0.5):
                 if news.kind == "triggers":
-                    held = Triggers.concat([held, news.value])
+                    triggers = Triggers.concat([triggers, news.value])
                     continue
-                # Those of the same piece stand before it in the queue.
+                # Triggers precede the events of their piece in the queue.
                 try:
-                    writer.write(news.value, held)
+                    writer.write(news.value, triggers)
                 except StreamError as fault:
-                    # The camera's clock has begun anew.
+                    # The camera's clock has restarted.
                     self._fault = str(fault)
                     return
                 self._events += len(news.value)
-                held = Triggers.empty()
+                triggers = Triggers.empty()
             free = shutil.disk_usage(writer.path.parent).free
-            if free < _LEAST_FREE:
-                expected = f"expected {_LEAST_FREE / 1e6:.0f}"
+            if free < _MIN_FREE_BYTES:
+                expected = f"expected {_MIN_FREE_BYTES / 1e6:.0f}"
                 self._fault = f"{writer.path}: {free / 1e6:.0f} MB are left on the disk: {expected}"
                 return
-        writer.write(Events.empty(), held)
+        writer.write(Events.empty(), triggers)

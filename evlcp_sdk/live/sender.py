@@ -1,4 +1,4 @@
-"""A source given to other programs over the network, as RAW words."""
+"""Sends a source to other programs over the network, as RAW words."""
 
 import socket
 import threading
@@ -13,29 +13,29 @@ from evlcp_sdk.live.publisher import Publisher, Subscription
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.signals import Stopped
 
-_MOST_PIECES: Final = 2000
-"""Pieces that wait for one who takes them slowly: two seconds of a camera."""
+_MAX_PIECES: Final = 2000
+"""Pieces that may wait for a slow client: two seconds of a camera."""
 
 _STALLED_S: Final = 10.0
-"""Who takes nothing for so long is let go."""
+"""A client that takes nothing for so long is disconnected."""
 
-_LOOK_S: Final = 0.2
+_POLL_S: Final = 0.2
 
 
 class Sender:
-    """Sends a source's events and triggers, EVT3, to all who connect; a context manager.
+    """Sends a source's events and triggers, EVT3, to all clients; a context manager.
 
-    Each gets a header and what comes from then on. Nobody is waited for: of one who is slow the oldest pieces
-    are dropped, which is counted; who takes nothing for ten seconds is let go.
+    Each gets a header and all pieces from then on. A slow client never delays the others: its oldest pieces
+    are dropped, which is counted; one that takes nothing for ten seconds is disconnected.
 
     Args:
-        source: What is sent; not closed. It must say the size of its sensor, or 1280 x 720 is taken.
-        tcp: Host and port to listen on; port 0 for any that is free. None for no TCP.
+        source: The source; not closed. A sensor of unknown size counts as 1280 x 720.
+        tcp: Host and port to listen on; port 0 for any free one. None for no TCP.
         unix: Path of a Unix socket to listen on, too; None for none.
 
     Attributes:
         port: The TCP port; 0 without.
-        counts: Pieces read and dropped, and listeners, so far.
+        counts: Events sent, clients, and pieces dropped.
 
     Raises:
         OutputError: It cannot listen there.
@@ -48,7 +48,7 @@ class Sender:
         self._publisher = Publisher()
         self._threads: list[threading.Thread] = []
         self._listening: list[socket.socket] = []
-        self._first = threading.Event()
+        self._connected = threading.Event()
         self._over = threading.Event()
         self._unix = unix
         self.port = 0
@@ -59,27 +59,27 @@ class Sender:
                 self._listening.append(socket.create_server(tcp, family=family))
                 self.port = self._listening[-1].getsockname()[1]
             if unix is not None:
-                made = socket.socket(socket.AF_UNIX)
-                self._listening.append(made)
-                made.bind(str(unix))
-                made.listen()
+                unix_socket = socket.socket(socket.AF_UNIX)
+                self._listening.append(unix_socket)
+                unix_socket.bind(str(unix))
+                unix_socket.listen()
         except OSError as fault:
             self.close()
-            where = f"{tcp[0]}:{tcp[1]}" if tcp is not None and not self.port else str(unix)
-            raise OutputError(f"{where}: cannot listen: {fault.strerror or fault}") from fault
+            address = f"{tcp[0]}:{tcp[1]}" if tcp is not None and not self.port else str(unix)
+            raise OutputError(f"{address}: cannot listen: {fault.strerror or fault}") from fault
         for one in self._listening:
-            one.settimeout(_LOOK_S)
+            one.settimeout(_POLL_S)
             self._start(self._accept, one)
 
     def wait(self, stopped: Stopped) -> bool:
-        """Wait until somebody has connected; False where that ends early."""
+        """Wait for the first client; False where `stopped` ends that."""
         while not stopped():
-            if self._first.wait(_LOOK_S):
+            if self._connected.wait(_POLL_S):
                 return True
         return False
 
     def run(self, stopped: Stopped = lambda: False) -> None:
-        """Send the source to its end, or until stopped; returns when all who listen have what was sent.
+        """Send the source to its end, or until stopped; return when all clients have got it.
 
         Raises:
             InputError: The source cannot be read on.
@@ -97,7 +97,7 @@ class Sender:
                 thread.join(2 * _STALLED_S)
 
     def close(self) -> None:
-        """Let all go."""
+        """Disconnect all clients."""
         self._over.set()
         self._publisher.close()
         for one in self._listening:
@@ -125,24 +125,24 @@ class Sender:
                 continue
             except OSError:
                 return
-            mine = self._publisher.subscribe({"events"}, most=_MOST_PIECES)
+            subscription = self._publisher.subscribe({"events"}, most=_MAX_PIECES)
             self.counts["listeners"] += 1
-            self._start(self._send, connection, mine)
-            self._first.set()
+            self._start(self._send, connection, subscription)
+            self._connected.set()
 
-    def _send(self, connection: socket.socket, mine: Subscription) -> None:
+    def _send(self, connection: socket.socket, subscription: Subscription) -> None:
         width, height = self._source.width or 1280, self._source.height or 720
         encoder = RawEncoder(EVT3)
         with connection:
             connection.settimeout(_STALLED_S)
             try:
                 connection.sendall(format_header(EVT3, width, height))
-                while not mine.ended:
-                    for news in mine.take():
+                while not subscription.ended:
+                    for news in subscription.take():
                         for words in encoder.encode(*news.value):
                             connection.sendall(words)
             except OSError:
-                pass  # It has left, or takes nothing.
+                pass  # The client has left, or takes nothing.
             finally:
-                self._publisher.leave(mine)
-                self.counts["pieces_dropped"] += mine.dropped
+                self._publisher.unsubscribe(subscription)
+                self.counts["pieces_dropped"] += subscription.dropped

@@ -1,4 +1,4 @@
-"""What the servers of a live run share: a thread with an event loop, and how one listens and ends."""
+"""The base of a live run's servers: a thread with an event loop, and how a server starts and ends."""
 
 import asyncio
 import os
@@ -13,25 +13,25 @@ from evlcp_sdk.live.publisher import Publisher
 _T = TypeVar("_T")
 
 FINISH_S = 1.0
-"""How long the end of a run waits for a server that has something to say still."""
+"""Longest wait at the end of a run for a server to send the rest."""
 
-_LEAVE_S = 2.0
-"""How long the end of a run waits for the servers: what a client has not taken by then is left."""
+_JOIN_S = 2.0
+"""Longest wait at the end of a run for the loop's thread."""
 
 
 class LoopThread:
-    """An event loop in a thread of its own; a context manager, whose end cancels all that runs in it."""
+    """An event loop in a thread of its own; a context manager, whose end cancels its tasks."""
 
     def __init__(self) -> None:
         self.loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, name="evlcp-loop", daemon=True)
 
     def call(self, job: Coroutine[Any, Any, _T]) -> _T:
-        """Run something in the loop; return what it returns, or raise what it raises."""
+        """Run a coroutine in the loop; return its result, or raise its exception."""
         return asyncio.run_coroutine_threadsafe(job, self.loop).result()
 
     def finish(self, task: "asyncio.Task[None]") -> None:
-        """Wait until a task is done, a moment at the most."""
+        """Wait until a task is done, for `FINISH_S` at most."""
 
         async def wait() -> None:
             await asyncio.wait([task], timeout=FINISH_S)
@@ -48,22 +48,22 @@ class LoopThread:
 
     def __exit__(self, *_fault: object) -> None:
         self.loop.call_soon_threadsafe(self.loop.stop)
-        self._thread.join(_LEAVE_S)
+        self._thread.join(_JOIN_S)
 
 
 class Server(ABC):
-    """A server of what a run publishes; runs in the loop of a `LoopThread`.
+    """A server of a run's results, in the loop of a `LoopThread`.
 
     Args:
-        publisher: Where results come from.
-        kinds: Of these.
-        most: How many wait for the server; the oldest go.
-        host: Where to listen.
-        port: The same; 0 for any that is free.
-        wake: Called when something has come, in the thread that published it.
+        publisher: Gives the results.
+        kinds: Kinds of results.
+        most: Results that may wait for the server; beyond, the oldest are dropped.
+        host: Address to listen at.
+        port: Port to listen at; 0 for any free one.
+        wake: Called after each result, in the thread that published it.
 
     Attributes:
-        port: Where it listens, once started.
+        port: Its port, once started.
     """
 
     def __init__(
@@ -76,54 +76,54 @@ class Server(ABC):
         wake: Callable[[], None] | None = None,
     ) -> None:
         self._publisher, self._host, self.port = publisher, host, port
-        self._mine = publisher.subscribe(kinds, most=most, wake=wake)
+        self._subscription = publisher.subscribe(kinds, most=most, wake=wake)
         self._unsent = 0
 
     @property
     @abstractmethod
     def url(self) -> str:
-        """Where it is to be found, once started."""
+        """Its address, once started."""
 
     @property
     def dropped(self) -> int:
-        """Results that clients were not sent as they did not take them, or as there was no time, so far."""
-        return self._mine.dropped + self._unsent
+        """Number of results that were not sent, as clients or the server were too slow."""
+        return self._subscription.dropped + self._unsent
 
     @abstractmethod
     async def _listen(self) -> Any:
-        """Begin to listen; the server of `asyncio` or `websockets`."""
+        """Start to listen; return the server of `asyncio` or `websockets`."""
 
     @abstractmethod
-    async def _tell_all(self) -> None:
-        """Send what comes until it has ended."""
+    async def _send_news(self) -> None:
+        """Send news until the subscription ends."""
 
     @abstractmethod
     def _abort(self) -> None:
-        """Close connections that nothing else closes when the loop ends."""
+        """Close connections that the end of the loop leaves open."""
 
     async def start(self) -> "asyncio.Task[None]":
-        """Listen; the task that is done when clients have had the last words.
+        """Start the server; return the task that ends when clients have got the rest.
 
         Raises:
-            ConfigError: The port cannot be had, or a package is not installed.
+            ConfigError: The port cannot be used, or a package is not installed.
         """
         try:
             listening = await self._listen()
         except OSError as fault:
-            self._publisher.leave(self._mine)
-            known = fault.errno is not None and fault.errno > 0
-            what = os.strerror(fault.errno or 0) if known else fault.strerror or str(fault)
+            self._publisher.unsubscribe(self._subscription)
+            has_number = fault.errno is not None and fault.errno > 0
+            reason = os.strerror(fault.errno or 0) if has_number else fault.strerror or str(fault)
             expected = "expected an address of this machine and a port of it that is free, 0 for any"
-            raise ConfigError(f"{self._host}:{self.port}: {what}: {expected}") from fault
+            raise ConfigError(f"{self._host}:{self.port}: {reason}: {expected}") from fault
         self.port = next(iter(listening.sockets)).getsockname()[1]
 
         async def serve() -> None:
             try:
-                await self._tell_all()
+                await self._send_news()
             finally:
-                self._publisher.leave(self._mine)
-                # Who is just connecting is let in first: asyncio would forget that connection, open. Its task
-                # has begun by then, and closes its connection when it is cancelled.
+                self._publisher.unsubscribe(self._subscription)
+                # A client that is just connecting is accepted first: asyncio would leave its connection open.
+                # Its task, once begun, closes it when cancelled.
                 for one in listening.sockets:
                     asyncio.get_running_loop().remove_reader(one.fileno())
                 for _ in range(5):

@@ -1,4 +1,4 @@
-"""What a live run serves beside its results: the web view, NMEA and gpsd's JSON over TCP."""
+"""The services of a live run: the web view, NMEA and gpsd's JSON over TCP."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -16,16 +16,16 @@ from evlcp_sdk.utc import ClockZero
 
 
 @dataclass(frozen=True)
-class Serving:
-    """What is served, and where.
+class ServiceOptions:
+    """The services and their ports.
 
     Attributes:
-        view: Whether there is a web view.
-        host: Where the web view listens: of this machine only, unless it is another address of it.
-        port: The same; 0 for any that is free.
-        record_to: Where browsers may have recordings written; None: they only look on.
+        view: There is a web view.
+        host: Address of the web view; others than this machine reach it only at another one.
+        port: Its port; 0 for any free one.
+        record_to: Folder in which browsers may start recordings; None to forbid it.
         nmea_port: Port of this machine for NMEA; None for none.
-        gpsd_port: The same for gpsd's JSON, whose usual one is 2947.
+        gpsd_port: The same for gpsd's JSON; its usual one is 2947.
     """
 
     view: bool = False
@@ -38,7 +38,7 @@ class Serving:
 
 @contextmanager
 def serve(
-    serving: Serving,
+    options: ServiceOptions,
     publisher: Publisher,
     links: Mapping[str, Link],
     *,
@@ -46,34 +46,34 @@ def serve(
     sites: Sequence[BarSite] = (),
     clock_zero: ClockZero = None,
 ) -> Iterator[dict[str, Server]]:
-    """Serve in a thread beside a live run; in the end what there is is told, and a recording completed.
+    """Serve in a thread beside a live run; at the end, send the rest and complete a recording.
 
-    Gives the servers that were asked for: `view`, `nmea` and `gpsd`.
+    Gives the servers in use: `view`, `nmea` and `gpsd`.
 
     Args:
-        serving: What.
-        publisher: Where results come from; closed in the end.
+        options: The services.
+        publisher: Gives the results; closed at the end.
         links: The configurations by name, as `name_links` gives them.
         name: Name of the source.
-        sites: Where the bars stand.
+        sites: Places of the bars.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
 
     Raises:
-        ConfigError: A port cannot be had, or a package is not installed.
+        ConfigError: A port cannot be used, or a package is not installed.
     """
     recorder = None
     servers: dict[str, Server] = {}
-    if serving.view:
-        if serving.record_to is not None:
+    if options.view:
+        if options.record_to is not None:
             camera = next(iter(links.values())).camera
-            recorder = Recorder(publisher, serving.record_to, camera.width, camera.height)
-        host, port = serving.host, serving.port
+            recorder = Recorder(publisher, options.record_to, camera.width, camera.height)
+        host, port = options.host, options.port
         servers["view"] = Viewer(
             publisher, links, name=name, sites=sites, host=host, port=port, recorder=recorder
         )
-    for kind, chosen in (("nmea", serving.nmea_port), ("gpsd", serving.gpsd_port)):
-        if chosen is not None:
-            servers[kind] = TcpOutput(publisher, gpsd=kind == "gpsd", port=chosen, clock_zero=clock_zero)
+    for kind, tcp_port in (("nmea", options.nmea_port), ("gpsd", options.gpsd_port)):
+        if tcp_port is not None:
+            servers[kind] = TcpOutput(publisher, gpsd=kind == "gpsd", port=tcp_port, clock_zero=clock_zero)
     with ExitStack() as stack:
         if servers:
             loop_thread = stack.enter_context(LoopThread())

@@ -1,9 +1,9 @@
-"""The web view of a live run: one page, and what it shows, over one WebSocket a browser.
+"""The web view of a live run: one page, and its data, over one WebSocket a browser.
 
-The receiver never waits for a browser. Results wait for each browser in a bounded queue, whose oldest go,
-counted; of pictures there is only the newest, drawn when a browser is ready for one. A browser is sent one
-bundle, what waits and the newest picture, for each credit that it gives, which is when it has shown the
-last one: one that stalls costs nothing.
+The receiver never waits for a browser. Results wait for each browser in a bounded queue that drops the
+oldest, counted; of pictures there is only the newest, drawn when a browser is ready for one. A browser gets
+one bundle, the waiting results and the newest picture, for each credit that it gives when it has shown the
+last one: a stalled browser costs nothing.
 """
 
 import asyncio
@@ -40,13 +40,12 @@ if TYPE_CHECKING:
 
 _KINDS: Final = frozenset({"frame", "message", "fix", "status", "end"})
 _PICTURES_PER_S: Final = 25
-_MOST_WAITING: Final = 4000
-"""Results that wait for a browser, some seconds of two bars; the oldest go."""
-_MOST_BROWSERS: Final = 16
-_MOST_SAID: Final = 4096
-"""Bytes of what a browser says."""
-_KEPT: Final = {"message": 50, "fix": 500}
-"""What a browser that comes later is shown of what was before; of other kinds but frames the last one."""
+_MAX_WAITING: Final = 4000
+"""Results that may wait for a browser, some seconds of two bars; beyond, the oldest are dropped."""
+_MAX_BROWSERS: Final = 16
+_MAX_REQUEST_BYTES: Final = 4096
+_HISTORY: Final = {"message": 50, "fix": 500}
+"""Earlier results that a new browser gets; of other kinds but frames the last one."""
 
 _HEADERS: Final = {
     "Content-Type": "text/html; charset=utf-8",
@@ -61,24 +60,24 @@ _HEADERS: Final = {
 
 @dataclass(eq=False)
 class _Browser:
-    """One that looks on.
+    """A connected browser.
 
     Attributes:
         socket: Its connection.
-        waiting: Results that it has not been sent, as JSON, the newest.
-        dropped: How many of them were pushed out.
-        ready: It has shown what it was sent.
-        picture: Number of the picture that it has.
+        waiting: The newest results that it has not got, as JSON.
+        dropped: Number of results that newer ones have pushed out.
+        ready: It has shown the last bundle.
+        picture: Number of its picture.
     """
 
     socket: "ServerConnection"
-    waiting: deque[str] = field(default_factory=lambda: deque(maxlen=_MOST_WAITING))
+    waiting: deque[str] = field(default_factory=lambda: deque(maxlen=_MAX_WAITING))
     dropped: int = 0
     ready: bool = False
     picture: int = -1
 
-    def put(self, line: str) -> bool:
-        """Have something sent; whether the oldest has gone for it, as the queue was full."""
+    def enqueue(self, line: str) -> bool:
+        """Add a line to the queue; whether it was full and has dropped the oldest."""
         full = len(self.waiting) == self.waiting.maxlen
         self.dropped += full
         self.waiting.append(line)
@@ -86,16 +85,16 @@ class _Browser:
 
 
 class Viewer(Server):
-    """Serves the page and what it shows.
+    """Serves the page and its data.
 
     Args:
-        publisher: Where results and pictures come from.
+        publisher: Gives results and pictures.
         links: The configurations by name, as `name_links` gives them.
         name: Name of the source, for the title.
-        sites: Where the bars stand, for the map.
-        host: Where to listen: of this machine only, unless it is another address of it.
-        port: The same; 0 for any that is free.
-        recorder: Starts and stops recordings as a browser asks; None: browsers only look on.
+        sites: Places of the bars, for the map.
+        host: Address to listen at; other machines reach it only at another one than the default.
+        port: Port to listen at; 0 for any free one.
+        recorder: Starts and stops recordings on a browser's request; None to forbid it.
     """
 
     def __init__(
@@ -109,76 +108,76 @@ class Viewer(Server):
         port: int = 0,
         recorder: Recorder | None = None,
     ) -> None:
-        super().__init__(publisher, _KINDS, _MOST_WAITING, host, port)
+        super().__init__(publisher, _KINDS, _MAX_WAITING, host, port)
         self._recorder = recorder
         self._serializer = Serializer(links, sites)
         self._name, self._links, self._sites = name, links, len(sites)
         self._token = secrets.token_urlsafe(16)
         self._browsers: set[_Browser] = set()
-        self._opened: WeakSet[ServerConnection] = WeakSet()
-        self._kept = {kind: deque[str](maxlen=most) for kind, most in _KEPT.items()}
+        self._connections: WeakSet[ServerConnection] = WeakSet()
+        self._history = {kind: deque[str](maxlen=most) for kind, most in _HISTORY.items()}
         self._page = ""
 
     @property
     def url(self) -> str:
-        """What to open in a browser; who has it may look on."""
+        """Address for a browser; whoever has it may watch."""
         host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(self._host, self._host)
         return f"http://{host}:{self.port}/{self._token}/"
 
     async def _listen(self) -> Any:
         websockets = import_extra("websockets.asyncio.server", "live")
 
-        def opened(*given: Any, **options: Any) -> "ServerConnection":
-            connection: ServerConnection = websockets.ServerConnection(*given, **options)
-            self._opened.add(connection)
+        def create_connection(*args: Any, **options: Any) -> "ServerConnection":
+            connection: ServerConnection = websockets.ServerConnection(*args, **options)
+            self._connections.add(connection)
             return connection
 
-        self._page = page(self._name)
-        given = {"compression": None, "max_size": _MOST_SAID, "server_header": None}
-        asked = {"process_request": self._answer, "create_connection": opened}
-        return await websockets.serve(self._serve, self._host, self.port, **given, **asked)
+        self._page = render_viewer_page(self._name)
+        options = {"compression": None, "max_size": _MAX_REQUEST_BYTES, "server_header": None}
+        hooks = {"process_request": self._answer_request, "create_connection": create_connection}
+        return await websockets.serve(self._serve, self._host, self.port, **options, **hooks)
 
     def _abort(self) -> None:
-        # A browser opens connections that it may need: their handshake, cancelled, would leave them open.
-        for connection in self._opened:
+        # A browser opens spare connections: a cancelled handshake would leave them open.
+        for connection in self._connections:
             if connection.request is None:
                 connection.transport.abort()
 
-    async def _tell_all(self) -> None:
-        loop, turn_s = asyncio.get_running_loop(), 0.0
-        while not self._mine.ended:
-            # At even times, unless they are over already.
+    async def _send_news(self) -> None:
+        loop, next_s = asyncio.get_running_loop(), 0.0
+        while not self._subscription.ended:
+            # At regular times, as far as they are not over.
             now_s = loop.time()
-            turn_s = max(turn_s + 1 / _PICTURES_PER_S, now_s)
-            await asyncio.sleep(turn_s - now_s)
-            for news in self._mine.take(0):
-                for kind, line in self._serializer.lines(news, frames=bool(self._browsers)):
-                    self._tell(kind, line)
-            self._send_all()
-        # The last words, once a browser has shown what it was sent before.
+            next_s = max(next_s + 1 / _PICTURES_PER_S, now_s)
+            await asyncio.sleep(next_s - now_s)
+            for news in self._subscription.take(0):
+                for kind, line in self._serializer.serialize(news, frames=bool(self._browsers)):
+                    self._enqueue(kind, line)
+            self._send_bundles()
+        # The rest, once a browser has shown the bundle before.
         await asyncio.sleep(2 / _PICTURES_PER_S)
-        self._send_all()
+        self._send_bundles()
         while any(browser.waiting for browser in self._browsers):
             await asyncio.sleep(1 / _PICTURES_PER_S)
-            self._send_all()
+            self._send_bundles()
 
-    # What browsers ask for
+    # Requests of browsers
 
-    def _answer(self, connection: "ServerConnection", request: "Request") -> "Response | None":
-        """Give the page, let a WebSocket through, or refuse."""
+    def _answer_request(self, connection: "ServerConnection", request: "Request") -> "Response | None":
+        """Return the page, let a WebSocket through, or refuse."""
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
-        given, _, rest = urlsplit(request.path).path.removeprefix("/").partition("/")
-        why = ""
+        token, _, rest = urlsplit(request.path).path.removeprefix("/").partition("/")
+        reason = ""
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
-            why = "this server is known by another name"
+            reason = "this server is known by another name"
         elif origins not in ([], [f"http://{hosts[0]}"]):
-            why = "the page of another server may not look on"
-        elif not secrets.compare_digest(given.encode(), self._token.encode()):
-            why = "expected the address that the run has printed, with its key"
-        if why:
-            return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
+            reason = "the page of another server may not look on"
+        elif not secrets.compare_digest(token.encode(), self._token.encode()):
+            reason = "expected the address that the run has printed, with its key"
+        if reason:
+            return connection.respond(HTTPStatus.FORBIDDEN, f"{reason}\n")
         if rest == "live":
-            if len(self._browsers) >= _MOST_BROWSERS:
+            if len(self._browsers) >= _MAX_BROWSERS:
                 return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many browsers look on\n")
             return None
         if rest:
@@ -189,7 +188,7 @@ class Viewer(Server):
         return response
 
     def _is_ours(self, host: str) -> bool:
-        """Whether a request was meant for this server: names of others may point to our address."""
+        """Whether a request is meant for this server: names of others may point to its address."""
         try:
             parts = urlsplit(f"//{host}")
             name, port = parts.hostname or "", parts.port or 80
@@ -209,12 +208,12 @@ class Viewer(Server):
         from websockets.exceptions import ConnectionClosed
 
         browser = _Browser(socket)
-        browser.waiting.extend(itertools.chain.from_iterable(self._kept.values()))
+        browser.waiting.extend(itertools.chain.from_iterable(self._history.values()))
         self._browsers.add(browser)
         try:
-            await socket.send(json.dumps(self._about()))
+            await socket.send(json.dumps(self._describe_run()))
             async for request in socket:
-                if not self._take_request(browser, request):
+                if not self._handle_request(browser, request):
                     await socket.close(1008, "not understood")
         except ConnectionClosed:
             pass  # It has gone.
@@ -224,24 +223,24 @@ class Viewer(Server):
         finally:
             self._browsers.discard(browser)
 
-    def _take_request(self, browser: _Browser, request: str | bytes) -> bool:
-        """Do what a browser asks for, if it may; whether that was understood."""
+    def _handle_request(self, browser: _Browser, request: str | bytes) -> bool:
+        """Handle a request of a browser; whether it is known and allowed."""
         try:
-            asked = json.loads(request)
+            command = json.loads(request)
         except ValueError:
             return False
-        if asked == {"next": True}:
+        if command == {"next": True}:
             browser.ready = True
-        elif self._recorder is not None and asked == {"record": True}:
+        elif self._recorder is not None and command == {"record": True}:
             self._recorder.start()
-        elif self._recorder is not None and asked == {"record": False}:
+        elif self._recorder is not None and command == {"record": False}:
             self._recorder.stop()
         else:
             return False
         return True
 
-    def _about(self) -> dict[str, Any]:
-        """What a browser is sent first."""
+    def _describe_run(self) -> dict[str, Any]:
+        """The first message to a browser."""
         return {
             "about": {
                 "name": self._name,
@@ -260,16 +259,16 @@ class Viewer(Server):
             }
         }
 
-    # What browsers are sent
+    # Messages to browsers
 
-    def _tell(self, kind: str, line: str) -> None:
-        """Send something to all browsers, and keep what later ones are sent."""
+    def _enqueue(self, kind: str, line: str) -> None:
+        """Add a line to the queues of all browsers, and to the history for later ones."""
         if kind != "frame":
-            self._kept.setdefault(kind, deque(maxlen=1)).append(line)
+            self._history.setdefault(kind, deque(maxlen=1)).append(line)
         for browser in self._browsers:
-            self._unsent += browser.put(line)
+            self._unsent += browser.enqueue(line)
 
-    def _send_all(self) -> None:
+    def _send_bundles(self) -> None:
         """Send a bundle to each browser that is ready for one."""
         ready = [browser for browser in self._browsers if browser.ready]
         if not ready:
@@ -277,36 +276,38 @@ class Viewer(Server):
         from websockets.asyncio.server import broadcast
 
         picture = self._publisher.pictures.newest
-        self._publisher.pictures.ask()
+        self._publisher.pictures.request()
         record = None if self._recorder is None else self._recorder.state
         end = f'"record": {json.dumps(record)}}}'
         for browser in ready:
-            told, data = '"picture": null, "bars": null', b""
+            members, data = '"picture": null, "bars": null', b""
             if picture is not None and browser.picture != picture.number:
                 browser.picture = picture.number
-                told, data = self._serializer.shot(picture)
+                members, data = self._serializer.serialize_picture(picture)
             elif not browser.waiting:
                 continue
-            dropped = browser.dropped + self._mine.dropped
-            text = f'{{"news": [{", ".join(browser.waiting)}], "dropped": {dropped}, {told}, {end}'.encode()
+            dropped = browser.dropped + self._subscription.dropped
+            text = (
+                f'{{"news": [{", ".join(browser.waiting)}], "dropped": {dropped}, {members}, {end}'.encode()
+            )
             browser.waiting.clear()
             browser.ready = False
-            # It waits for nothing: of one that does not read there is no second bundle under way.
+            # This does not wait: a browser that does not read has no second bundle under way.
             broadcast([browser.socket], struct.pack("<I", len(text)) + text + data)
 
 
-def page(name: str) -> str:
-    """The page: HTML with all that it needs in it."""
-    here = files("evlcp_sdk.live")
-    read: Mapping[str, str] = {
-        part: here.joinpath(*part.split("/")).read_text("utf-8")
+def render_viewer_page(name: str) -> str:
+    """The page: HTML with all its parts."""
+    folder = files("evlcp_sdk.live")
+    parts: Mapping[str, str] = {
+        part: folder.joinpath(*part.split("/")).read_text("utf-8")
         for part in ("page.html", "page.js", "page.css", "uplot/uPlot.js", "uplot/uPlot.css")
     }
     return render_page(
-        TEMPLATES.from_string(read["page.html"]),
+        TEMPLATES.from_string(parts["page.html"]),
         f"{name} - live",
-        [read["uplot/uPlot.js"], read["page.js"]],
+        [parts["uplot/uPlot.js"], parts["page.js"]],
         connect=True,
         name=name,
-        style=Markup(read["uplot/uPlot.css"] + read["page.css"]),
+        style=Markup(parts["uplot/uPlot.css"] + parts["page.css"]),
     )

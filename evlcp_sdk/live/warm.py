@@ -1,4 +1,4 @@
-"""Kernels loaded before anything is live."""
+"""Loads kernels before a live run starts."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -16,46 +16,45 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.values import Events
 
-_WARM_US = 30_000
+_LENGTH_US = 30_000
 """Of the recording that comes with the SDK: three packets, of which two are whole."""
 
 
 _PLACE: Final = (-2.0, 50.0, 0.5)
-"""Of a bar, east, north and up of a camera that looks north, m."""
+"""Of a bar, east, north and up of a camera that faces north, m."""
 
 
-def warm_up(links: Sequence[Link], *, positions: bool = False) -> None:
-    """Load what receiving needs, by receiving a piece of the recording that comes with the SDK.
+def load_kernels(links: Sequence[Link], *, positions: bool = False) -> None:
+    """Load the kernels of a receiver by receiving a piece of the recording that comes with the SDK.
 
-    Then the same again as a camera sees it that shakes, at half of the light: what reads a doubtful frame a
-    second time is needed then.
+    Then again with vibration and half of the light, which needs the second reading of uncertain frames.
 
     Args:
-        links: What will be received.
-        positions: Load what positions need, too, by a fix.
+        links: The receiver's links.
+        positions: Load the kernels of positions, too, by a fix.
     """
     if positions:
         for link in links:
-            _find_place(link)
-    for shaking in (False, True):
+            _solve_bar_pose(link)
+    for vibrates in (False, True):
         receiver, pictures, camera = Receiver(links), PictureSlot(), links[0].camera
         with RawSource(find_shipped_file("recordings", "night-50m-30kmh-cut.raw")) as source:
             first_us = None
             for events in source.chunks(1 << 14):
                 first_us = int(events.t_us[0]) if first_us is None else first_us
-                shown = _shaken(events) if shaking else events
-                pictures.ask()
-                pictures.add(shown, camera.width, camera.height, receiver.regions)
+                events = _add_vibration(events) if vibrates else events
+                pictures.request()
+                pictures.add(events, camera.width, camera.height, receiver.regions)
                 if pictures.newest is not None:
-                    pictures.newest.image().to_png()
-                receiver.feed(shown)
-                if int(events.t_us[0]) > first_us + _WARM_US:
+                    pictures.newest.to_image().to_png()
+                receiver.feed(events)
+                if int(events.t_us[0]) > first_us + _LENGTH_US:
                     break
         receiver.close()
 
 
-def _find_place(link: Link) -> None:
-    """Solve for a camera that sees a bar."""
+def _solve_bar_pose(link: Link) -> None:
+    """Solve for the pose of a camera that sees a bar."""
     attitude = Attitude(heading_deg=0.0)
     along = np.linspace(0.5, -0.5, link.bar.clusters)[:, None] * (0.0, 0.0, link.bar.length_m)
     points, _ = project_bars(along + _PLACE, np.zeros(3), attitude.rotation(), link.camera)
@@ -63,8 +62,8 @@ def _find_place(link: Link) -> None:
     solve_pose([view], link.camera, attitude, ErrorModel.of(link.position), link.camera_sigma)
 
 
-def _shaken(events: Events) -> Events:
-    """Every second event, two pixels to and fro in three milliseconds: within a frame."""
-    some = events[::2]
-    shift_px = np.rint(2 * np.sin(2 * np.pi / 3000 * some.t_us)).astype(np.int64)
-    return Events.of(some.t_us, some.x + shift_px, some.y, some.p)
+def _add_vibration(events: Events) -> Events:
+    """Every second event, moved by two pixels to and fro in three milliseconds: within a frame."""
+    half = events[::2]
+    shift_px = np.rint(2 * np.sin(2 * np.pi / 3000 * half.t_us)).astype(np.int64)
+    return Events.of(half.t_us, half.x + shift_px, half.y, half.p)

@@ -35,7 +35,7 @@ def test_each_listener_gets_its_kinds_and_its_queue() -> None:
     assert (frames.dropped, everything.dropped, len(woken)) == (2, 0, 5)
     assert [(news.kind, news.value) for news in everything.take()][:2] == [("frame", 0), ("status", 0)]
     assert frames.take(timeout_s=0) == []
-    publisher.leave(frames)
+    publisher.unsubscribe(frames)
     publisher.publish("frame", 9.0, 9)
     assert frames.ended
     assert not everything.ended
@@ -93,12 +93,12 @@ def paint(cells: np.ndarray, events: Events) -> None:
 
 def test_a_picture_shows_what_each_pixel_did() -> None:
     slot = PictureSlot()
-    slot.ask()
+    slot.request()
     events = events_at(np.sort(np.random.default_rng(2).integers(0, 50_000, 4000)))
     drawn = []
     for from_us in range(0, 50_000, 5000):
         if from_us in (25_000, 45_000):
-            slot.ask()
+            slot.request()
         before = slot.newest
         slot.add(events[(events.t_us >= from_us) & (events.t_us < from_us + 5000)], 1280, 720, [])
         if slot.newest is not before:
@@ -107,7 +107,7 @@ def test_a_picture_shows_what_each_pixel_did() -> None:
     for picture in drawn:
         cells = np.zeros((720, 1280), np.uint8)
         paint(cells, events[(events.t_us > picture.t_us - 10_000) & (events.t_us <= picture.t_us)])
-        assert (picture.image().cells == cells).all()
+        assert (picture.to_image().cells == cells).all()
 
 
 def test_what_is_shed_and_counted_is_what_lies_outside() -> None:
@@ -139,7 +139,7 @@ def test_a_budget_rises_at_once_and_falls_at_half() -> None:
     budget = Budget(waiting_ms=10, most_ms=100)
     levels, level = [], 0
     for waiting_ms in (0, 11, 6, 4, 21, 15, 9, 41, 101, 60, 49, 19, 9, 4):
-        level = budget.level(waiting_ms, level)
+        level = budget.choose_level(waiting_ms, level)
         levels.append(level)
     assert levels == [0, 1, 1, 0, 2, 2, 1, 3, 4, 4, 3, 2, 1, 0]
     with pytest.raises(ConfigError, match="the most at least four times"):
@@ -153,11 +153,11 @@ def test_the_least_delay_of_the_last_seconds_is_none_and_drift_is_followed() -> 
         t_us = n * 1000.0
         # The camera's clock is 100 ppm slow; slices come up to 3 ms late.
         arrived_s = 5.0 + t_us * 1e-6 * 1.0001 + rng.uniform(0, 3e-3)
-        clock.arrived(t_us, arrived_s)
-    assert abs(clock.at_s(20e6) - (5.0 + 20 * 1.0001)) < 0.5e-3
+        clock.add_arrival(t_us, arrived_s)
+    assert abs(clock.to_host_s(20e6) - (5.0 + 20 * 1.0001)) < 0.5e-3
     # The camera's clock leaps ahead by a minute.
-    clock.arrived(80e6, 25.1)
-    assert clock.at_s(80e6) == pytest.approx(25.1)
+    clock.add_arrival(80e6, 25.1)
+    assert clock.to_host_s(80e6) == pytest.approx(25.1)
 
 
 class Counted(EventSource):
@@ -197,7 +197,7 @@ def read_all(source: Counted) -> tuple[Reader, list[int]]:
 
 
 def test_a_file_waits_for_its_reader_and_a_camera_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("evlcp_sdk.live.reader._MOST_EVENTS", 50)
+    monkeypatch.setattr("evlcp_sdk.live.reader._MAX_EVENTS", 50)
     reader, got = read_all(Counted(live=False))
     assert got == list(range(1000))
     assert (reader.dropped, reader.fault) == (0, None)

@@ -43,7 +43,7 @@ def gather(subscription: Subscription) -> dict[str, list[Any]]:
 
 def test_a_replay_gives_what_the_file_gives(demo_raw, tmp_path, capsys) -> None:
     publisher = Publisher()
-    publisher.pictures.ask()
+    publisher.pictures.request()
     mine = publisher.subscribe(most=100_000)
     given: dict[str, Any] = {"publisher": publisher, "budget": PATIENT, "warm": False}
     summary = live(f"replay:{demo_raw}?speed=50", tmp_path / "out", **given)
@@ -276,7 +276,7 @@ def test_what_the_page_is_asked_for_needs_a_page(evlcp: Callable[..., Any], demo
 _WARMED = """
 import sys
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.live.warm import warm_up
+from evlcp_sdk.live.warm import load_kernels
 from evlcp_sdk.place.navigator import Navigator, PositionPlan
 from evlcp_sdk.run import live
 from tests.unit.results.test_positions import ATTITUDE, SITE, packets
@@ -287,7 +287,7 @@ def loaded():
             if hasattr(k, "overloads")}
 
 link = load_link()
-warm_up([link], positions=True)
+load_kernels([link], positions=True)
 before, modules = loaded(), set(sys.modules)
 live(sys.argv[1], None, link, warm=False)
 navigator = Navigator(link, PositionPlan((SITE,)), ATTITUDE)

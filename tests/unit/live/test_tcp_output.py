@@ -12,14 +12,14 @@ import pytest
 
 from evlcp_sdk.live import Publisher
 from evlcp_sdk.live.server import Server
-from evlcp_sdk.live.services import Serving, serve
+from evlcp_sdk.live.services import ServiceOptions, serve
 from tests.unit.live.helpers import LINKS, dies, publish_fix
 
 
 @pytest.fixture
 def served() -> Iterator[tuple[Publisher, dict[str, Server]]]:
     publisher = Publisher()
-    with serve(Serving(nmea_port=0, gpsd_port=0), publisher, LINKS, name="x") as services:
+    with serve(ServiceOptions(nmea_port=0, gpsd_port=0), publisher, LINKS, name="x") as services:
         yield publisher, services
         publisher.close()
 

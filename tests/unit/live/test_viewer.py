@@ -25,8 +25,8 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io.open import open_source
 from evlcp_sdk.live import Publisher, server
 from evlcp_sdk.live.recorder import Recorder
-from evlcp_sdk.live.services import Serving, serve
-from evlcp_sdk.live.viewer import Viewer, page
+from evlcp_sdk.live.services import ServiceOptions, serve
+from evlcp_sdk.live.viewer import Viewer, render_viewer_page
 from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.run import live
 from evlcp_sdk.scene.sites import LocalAxes
@@ -74,7 +74,9 @@ class Stage:
 @contextmanager
 def run_viewer(**given: Any) -> Iterator[Stage]:
     publisher = Publisher()
-    with serve(Serving(view=True, **given), publisher, LINKS, name="a name", sites=(SITE,)) as services:
+    with serve(
+        ServiceOptions(view=True, **given), publisher, LINKS, name="a name", sites=(SITE,)
+    ) as services:
         yield Stage(publisher, services["view"])  # type: ignore[arg-type]
         publisher.close()
 
@@ -97,7 +99,7 @@ def next_of(link: ClientConnection) -> tuple[dict[str, Any], bytes]:
 
 
 def test_the_page_needs_nothing_else_and_names_cannot_write_it() -> None:
-    text = page(HOSTILE)
+    text = render_viewer_page(HOSTILE)
     assert HOSTILE not in text
     assert "default-src 'none'" in text
     assert "connect-src 'self'" in text
@@ -143,7 +145,7 @@ def test_a_credit_a_bundle(stage: Stage) -> None:
         assert (head["picture"], picture) == (None, b"")
         link.send('{"next": true}')
         # One is drawn once it is asked for.
-        wait_until(lambda: stage.publisher.pictures._asked)
+        wait_until(lambda: stage.publisher.pictures._requested)
         stage.picture(20_000)
         head, picture = bundle_of(link)
         assert (head["news"], head["picture"]["t_us"]) == ([], 20_000)
@@ -235,12 +237,12 @@ def test_a_recording_is_what_came(tmp_path: Path) -> None:
         link.recv(30)
         publish(publisher, 1_000)
         link.send('{"record": true}')
-        wait_until(lambda: publisher.wanted("events"))
+        wait_until(lambda: publisher.has_listeners("events"))
         publish(publisher, 2_000)
         publisher.publish("triggers", 2_500, Triggers.of([2_500, 3_004], [0, 0], [1, 0]))
         publish(publisher, 3_000)
         link.send('{"record": false}')
-        wait_until(lambda: not publisher.wanted("events"))
+        wait_until(lambda: not publisher.has_listeners("events"))
         publish(publisher, 4_000)
         wait_until(lambda: any(folder.glob("live-*.raw")))
         stage.frame(0)
