@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 
 from evlcp_sdk.sim import SensorSpec, Simulation, load_scene
-from evlcp_sdk.sim.simulation import sensor_vector
+from evlcp_sdk.sim.simulation import pack_sensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -117,7 +117,7 @@ def main() -> None:
         )
 
     spec = SensorSpec(noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)
-    sensor = sensor_vector(spec)
+    sensor = pack_sensor(spec)
     bits = np.random.default_rng(0).integers(0, 2, 2000)
     light = np.where(np.stack([1 - bits, bits], 1).ravel(), 51.0, 0.05)
     edges = np.arange(light.size) * 100.0

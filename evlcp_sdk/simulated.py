@@ -12,7 +12,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.scene.sites import to_toml
 from evlcp_sdk.sim import Scene, Simulation, Truth, load_scene, resolve_scene, truth_of, truth_path
-from evlcp_sdk.sim.world import attitude_log, surveyed_sites
+from evlcp_sdk.sim.world import attitude_log, survey_sites
 from evlcp_sdk.values import Events, Triggers
 
 Advance = Callable[[float], None]
@@ -108,7 +108,7 @@ def _survey_files(simulation: Simulation, out: Path) -> dict[Path, str]:
     scene = simulation.scene
     if scene.world is None:
         return {}
-    files = {out.with_suffix(".site.toml"): to_toml(surveyed_sites(scene, scene.seed))}
+    files = {out.with_suffix(".site.toml"): to_toml(survey_sites(scene, scene.seed))}
     log = attitude_log(scene, scene.seed, simulation.path)
     if log is not None:
         files[out.with_suffix(".attitude.csv")] = log.to_csv()

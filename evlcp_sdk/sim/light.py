@@ -1,4 +1,4 @@
-"""What the sources send: strips of light whose parts switch at exact times."""
+"""The light of bars and lamps: strips whose parts switch at exact times."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ from evlcp_sdk.link.compose import beacon_of_site, encode_messages
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite
-from evlcp_sdk.sim.leds import LitStrip, lit_strips
+from evlcp_sdk.sim.leds import LitStrip, split_into_strips
 from evlcp_sdk.sim.motion import Strip
 from evlcp_sdk.sim.optics import led_light_w_m2
 from evlcp_sdk.sim.scene import (
@@ -31,20 +31,20 @@ from evlcp_sdk.sim.scene import (
     WiperSpec,
     links_of,
 )
-from evlcp_sdk.sim.world import bar_across, bar_axis, bar_towards, sites_of
+from evlcp_sdk.sim.world import bar_axis, bar_normal, bar_right, sites_of
 
 Floats = NDArray[np.float64]
 
 _SINE_STEPS = 32
 
 _WIPER_STEP_LN = 0.05
-"""Steps of the light while a wiper's edge passes: a quarter of a threshold, so that none is an event."""
+"""Steps of the light while a wiper's edge passes: a quarter of a threshold, too little for an event."""
 
 _BACKGROUND_STEP_LN = 0.01
-"""The same while the background changes: a twentieth of a threshold, so that as many events come."""
+"""Steps of the light while the background changes: a twentieth of a threshold keeps the number of events."""
 
 _SLAT_STEP_UM = 1000.0
-"""How far a lattice moves along a bar until it hides other parts of it, um: a tenth of an LED's place."""
+"""Steps in which a lattice moves along a bar, um: a tenth of an LED's pitch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +52,11 @@ class Source:
     """A strip of light that switches as a whole or part by part, or an image of one.
 
     Attributes:
-        strip: Where it is.
+        strip: The strip in the scene.
         light_w_m2: Irradiance of a pixel that it fills.
-        longest_us: How long its light may move a slow pixel the same way at full swing, us.
-        switches: Takes two times, us, and gives those of switching between them, float64 (n,), and the levels
-            0 to 1 from each on, float64 (n + 1, parts), the first those at the first time.
+        longest_us: How long its full light may move a slow pixel the same way, us.
+        switches: Takes two times, us, and returns the times of switching between them, float64 (n,), and the
+            levels from 0 to 1 from the first time and from each of these on, float64 (n + 1, parts).
         image: The reflection that shows it; None for the direct view.
     """
 
@@ -68,7 +68,7 @@ class Source:
 
 
 def cut_changes(when_us: Floats, held: Floats, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-    """Of times of change, with what holds before, between and after them, those inside a span of time."""
+    """Cut changes, and the values held before and after each, to a span of time."""
     first, last = np.searchsorted(when_us, begin_us, "right"), np.searchsorted(when_us, end_us, "left")
     return when_us[first:last], held[first : last + 1]
 
@@ -76,22 +76,21 @@ def cut_changes(when_us: Floats, held: Floats, begin_us: float, end_us: float) -
 class BarLight:
     """A transmitter's light: packets, one after another, or the chips of a file.
 
-    Its `strips` are what shines, all switched by the same chips, its `light_w_m2` the irradiance of a pixel
-    that the brightest fills; its `images` are the same again for each reflection. Of its `dark` clusters no
-    LED blinks.
+    Its `strips` are all switched by the same chips; a pixel that the brightest fills has `light_w_m2`. Its
+    `images` repeat the strips for each reflection. No LED of its `dark` clusters blinks.
 
     Args:
         bar: The bar.
         link: The link that it sends with.
         lens: The lens, by which LEDs light a pixel.
-        seed: Of its payload and its start, where the bar has none of its own.
-        source: What faults name.
-        transmitter_id: What its messages say who it is.
-        site: What its beacon says; None for none.
-        reflections: Its images.
+        seed: Seed of its payload and start, unless the bar has one.
+        source: Name of the bar in error messages.
+        transmitter_id: Sender of its messages.
+        site: Site in its beacon; None sends none.
+        reflections: Its reflections.
 
     Raises:
-        ConfigError: Its symbols, messages or chips cannot be sent, or what covers it is none of its clusters.
+        ConfigError: Its symbols, messages or chips cannot be sent, or a cover is of none of its clusters.
         InputError: The file of chips cannot be read.
     """
 
@@ -110,14 +109,14 @@ class BarLight:
         self.link = link
         self.payload_seed = seed if bar.seed is None else bar.seed
         try:
-            strips = lit_strips(bar, link.bar, self.payload_seed)
+            strips = split_into_strips(bar, link.bar, self.payload_seed)
         except ConfigError as refused:
             raise ConfigError(f"{source}.{refused}") from refused
         lights = [led_light_w_m2(bar, strip, lens) for strip in strips]
         self.light_w_m2 = max(lights)
         self.centre_m = (bar.x_m, bar.y_m, bar.z_m)
         self.rate_hz = link.air.chip_rate_hz * (1 + bar.ppm * 1e-6)
-        # The codes rest for two chips at most, and by half their swing from their mean.
+        # Codes are constant for two chips at most, half their amplitude from their mean.
         self.longest_us = 1e6 / self.rate_hz
         self._chips: NDArray[np.uint8] | None = None
         self._packets: dict[int, NDArray[np.uint8]] = {}
@@ -131,34 +130,34 @@ class BarLight:
                 if bar.payload != "symbols":
                     self._coder = link.block_coder()
                 if bar.payload == "messages":
-                    self._cycle = self._messages(site)
+                    self._cycle = self._encode_messages(site)
             except ConfigError as refused:
                 raise ConfigError(f"{source}: {refused}") from refused
             self.packet_chips = link.packet.packet_chips
             if bar.symbols is not None:
-                self._check(bar, source)
+                self._check_symbols(bar, source)
         start = bar.start_chip
         if start is None:
             start = round(
                 float(np.random.default_rng([self.payload_seed, 1]).uniform(0, self.packet_chips)), 1
             )
         self.start_chip = start
-        self._covers = self._checked_covers(source)
-        lit = {int(k) for strip in strips for k in strip.clusters[strip.swing > 0]}
+        self._covers = self._check_covers(source)
+        lit = {int(k) for strip in strips for k in strip.clusters[strip.switched > 0]}
         self.dark = set(range(link.codebook.clusters)) - lit
         shares = [light / self.light_w_m2 if self.light_w_m2 else 1.0 for light in lights]
-        self.strips = tuple(map(self._source, strips, shares))
+        self.strips = tuple(map(self._make_source, strips, shares))
         self.images = tuple(
-            self._source(strip, share, one)
+            self._make_source(strip, share, one)
             for one in reflections
             for strip, share in zip(strips, shares, strict=True)
         )
 
-    def _source(self, lit: LitStrip, share: float, image: ReflectionSpec | None = None) -> Source:
-        """A strip of the layout in the scene, with its share of the light, or as a reflection shows it."""
-        axes = np.stack([bar_across(self.bar), bar_axis(self.bar), bar_towards(self.bar)])
+    def _make_source(self, lit: LitStrip, share: float, image: ReflectionSpec | None = None) -> Source:
+        """Place a strip of the layout in the scene, with its share of the light, or its reflection."""
+        axes = np.stack([bar_right(self.bar), bar_axis(self.bar), bar_normal(self.bar)])
         centre_m = np.array(self.centre_m) + np.array(lit.centre_m) @ axes
-        along_m = lit.length_m * axes[int(lit.down)]
+        along_m = lit.length_m * axes[int(lit.is_vertical)]
         if image is not None:
             share *= image.share
             if image.kind != "window":
@@ -170,14 +169,14 @@ class BarLight:
 
         def switches(begin_us: float, end_us: float) -> tuple[Floats, Floats]:
             when, levels = self.switches(begin_us, end_us)
-            shown = levels[:, lit.clusters] * lit.swing + lit.rest
-            return (when, shown) if image else self.cover(when, shown, begin_us, end_us, lit)
+            shown = levels[:, lit.clusters] * lit.switched + lit.constant
+            return (when, shown) if image else self.hide_clusters(when, shown, begin_us, end_us, lit)
 
         strip = Strip(centre_m, along_m, lit.width_m, lit.cuts)
         return Source(strip, self.light_w_m2 * share, self.longest_us, switches, image)
 
-    def _checked_covers(self, source: str) -> tuple[tuple[float, float, int, int], ...]:
-        """What passes before it, poles included: (from us, to us, first cluster, last cluster)."""
+    def _check_covers(self, source: str) -> tuple[tuple[float, float, int, int], ...]:
+        """Return what hides clusters for a time: (from us, to us, first cluster, last cluster)."""
         bar, last = self.bar, self.link.codebook.clusters - 1
         if not all(0 <= k <= last for k in bar.covered):
             raise ConfigError(f"{source}.covered = {list(bar.covered)}: expected clusters, 0 to {last}")
@@ -202,29 +201,29 @@ class BarLight:
         poles = tuple((a, b, 0, last) for a, b in bar.pole_s)
         return tuple((a * 1e6, b * 1e6, first, end) for a, b, first, end in (*bar.cover_s, *poles))
 
-    def cover(
+    def hide_clusters(
         self, when_us: Floats, levels: Floats, begin_us: float, end_us: float, lit: LitStrip
     ) -> tuple[Floats, Floats]:
-        """Put out what is hidden.
+        """Darken what covers hide.
 
         Args:
             when_us: Times of switching after `begin_us` and before `end_us`, float64 (n,).
-            levels: From each on, float64 (n + 1, parts).
-            begin_us: When the first levels hold.
-            end_us: Until when the last hold.
-            lit: The parts.
+            levels: Levels from `begin_us` and from each on, float64 (n + 1, parts).
+            begin_us: Start of the first levels.
+            end_us: End of the last levels.
+            lit: The strip of these parts.
 
         Returns:
-            The same with the times at which something begins or ends to hide clusters.
+            The times, with those at which a cover starts or ends, and the levels.
         """
         slats, speed_mps = self.bar.lattice_m, self.bar.lattice_mps
         if not self._covers and not self.bar.covered and slats is None:
             return when_us, levels
         edges = np.array([t for cover in self._covers for t in cover[:2] if begin_us < t < end_us])
-        pace = abs(speed_mps) / _SLAT_STEP_UM
-        if slats is not None and pace:
-            steps = np.arange(math.floor(begin_us * pace) + 1, math.ceil(end_us * pace))
-            edges = np.append(edges, steps / pace)
+        steps_per_us = abs(speed_mps) / _SLAT_STEP_UM
+        if slats is not None and steps_per_us:
+            steps = np.arange(math.floor(begin_us * steps_per_us) + 1, math.ceil(end_us * steps_per_us))
+            edges = np.append(edges, steps / steps_per_us)
         when = np.sort(np.concatenate([when_us, edges]))
         start = np.append(begin_us, when)
         seen: Floats = levels[np.searchsorted(when_us, start, side="right")]
@@ -234,14 +233,14 @@ class BarLight:
             seen[np.ix_((start >= from_us) & (start < to_us), behind)] = 0.0
         if slats is not None:
             every_m, width_m, first_m = slats
-            # Length that slats hide above each cut, of the cuts' places among the slats.
-            moved_m = np.floor(start * pace + 1e-6) * math.copysign(1e-6 * _SLAT_STEP_UM, speed_mps)
+            # Length that slats hide above each cut, by its place among the slats.
+            moved_m = np.floor(start * steps_per_us + 1e-6) * math.copysign(1e-6 * _SLAT_STEP_UM, speed_mps)
             at_m = (np.array(lit.cuts) + 0.5) * lit.length_m - first_m - moved_m[:, None]
             hidden = at_m // every_m * width_m + np.minimum(at_m % every_m, width_m)
             seen *= 1 - np.diff(hidden, axis=1) / np.diff(at_m, axis=1)
         return when, seen
 
-    def _check(self, bar: BarSpec, source: str) -> None:
+    def _check_symbols(self, bar: BarSpec, source: str) -> None:
         assert bar.symbols is not None
         if bar.payload != "symbols":
             raise ConfigError(
@@ -258,8 +257,8 @@ class BarLight:
         if not bar.symbols:
             raise ConfigError(f"{source}.symbols: expected at least one packet")
 
-    def _messages(self, site: BarSite | None) -> NDArray[np.int64]:
-        """Packets of its beacon and its text, one after another: int64 (packets, frames, clusters)."""
+    def _encode_messages(self, site: BarSite | None) -> NDArray[np.int64]:
+        """Return packets of its beacon and its text in turn, int64 (packets, frames, clusters)."""
         identity, found = self._transmitter_id, []
         if site is not None:
             found.append(Message(Kind.BEACON, identity, 0, beacon_of_site(site).pack()))
@@ -272,12 +271,12 @@ class BarLight:
         return encode_messages(found, self._coder)
 
     def symbols(self, packet: int) -> NDArray[np.int64]:
-        """Symbols of a packet, counted from the one that `start_chip` is in: int64 (frames, clusters)."""
+        """Return the symbols of a packet, counted from that of `start_chip`, int64 (frames, clusters)."""
         if self.bar.symbols is not None:
             return np.array(self.bar.symbols[packet % len(self.bar.symbols)], np.int64)
         if self.bar.payload == "messages":
-            again: NDArray[np.int64] = self._cycle[packet % len(self._cycle)]
-            return again
+            repeated: NDArray[np.int64] = self._cycle[packet % len(self._cycle)]
+            return repeated
         rng = np.random.default_rng([self.payload_seed, 2, packet])
         if self.bar.payload == "data":
             part = rng.bytes(self._coder.block_bytes - HEADER_BYTES)
@@ -287,15 +286,15 @@ class BarLight:
         book = self.link.codebook
         return rng.integers(0, book.data_symbols, (self.link.packet.frames, book.clusters))
 
-    def sent_symbols(self, duration_s: float) -> list[list[list[int]]]:
-        """Symbols [packet][frame][cluster] of every packet that at least starts in the scene."""
+    def list_symbols(self, duration_s: float) -> list[list[list[int]]]:
+        """Return the symbols [packet][frame][cluster] of every packet that starts in the scene."""
         if self._chips is not None:
             return []
         packets = math.floor((self.start_chip + duration_s * self.rate_hz) / self.packet_chips) + 1
         return [self.symbols(q).tolist() for q in range(packets)]
 
     def chips(self, first: int, last: int) -> NDArray[np.uint8]:
-        """Chips [first, last) as the transmitter counts them: uint8 (n, clusters)."""
+        """Return chips [first, last) by the transmitter's count, uint8 (n, clusters)."""
         if self._chips is not None:
             return self._chips[np.arange(first, last) % len(self._chips)]
         begin, end = first // self.packet_chips, (last - 1) // self.packet_chips + 1
@@ -309,7 +308,7 @@ class BarLight:
         return rows[first - begin * self.packet_chips : last - begin * self.packet_chips]
 
     def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-        """Times of switching and levels of all clusters; see `Source`."""
+        """Return times of switching and levels of all clusters; see `Source`."""
         first = math.floor(self.start_chip + begin_us * 1e-6 * self.rate_hz) - 1
         last = math.ceil(self.start_chip + end_us * 1e-6 * self.rate_hz) + 2
         first = max(first, 0)
@@ -329,7 +328,7 @@ def _read_chips(path: Path, clusters: int) -> NDArray[np.uint8]:
 
 
 def _longest_run(chips: NDArray[np.uint8]) -> int:
-    """The longest run of equal chips in any cluster, chips; sent again and again."""
+    """Return the longest run of equal chips of any cluster when the chips are repeated."""
     twice = np.concatenate([chips, chips])
     longest = 1
     for cluster in twice.T:
@@ -338,8 +337,8 @@ def _longest_run(chips: NDArray[np.uint8]) -> int:
     return longest
 
 
-def lamp_source(lamp: LampSpec) -> Source:
-    """A lamp's light: a square wave, or the square of a sine in steps."""
+def make_lamp_source(lamp: LampSpec) -> Source:
+    """Make the source of a lamp: a square wave, or the square of a sine in steps."""
     if lamp.waveform == "square":
         offsets, values = np.array([0.0, lamp.duty]), np.array([1.0, 0.0])
     else:
@@ -360,16 +359,17 @@ def lamp_source(lamp: LampSpec) -> Source:
 
 
 def wiper_switches(wiper: WiperSpec, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-    """Return when a wiper changes the light after `begin_us` and before `end_us`, and its share from each on.
+    """Return when a wiper changes the light after `begin_us` and before `end_us`, and the share that passes.
 
-    While an edge passes, the light falls or rises evenly with time, in steps that are even in the logarithm.
+    While an edge passes, the light changes linearly with time, in even steps of its logarithm.
 
     Returns:
-        Times float64 (n,), us; shares of the light that passes float64 (n + 1,), from `begin_us` on.
+        Times, us, float64 (n,); shares of the light from `begin_us` and from each of them on, float64 (n +
+        1,).
     """
     lowest = 1 - wiper.share
     steps = max(1, math.ceil(-math.log(lowest) / _WIPER_STEP_LN))
-    # Step i falls as the line passes the geometric middle between its level and the last one's.
+    # Step i falls as the line passes the geometric mean of its level and the one before.
     levels = lowest ** (np.arange(1, steps + 1) / steps)
     fall_us = (
         (1 - lowest ** ((np.arange(steps) + 0.5) / steps)) / max(wiper.share, 1e-12) * wiper.edge_s * 1e6
@@ -386,7 +386,7 @@ def wiper_switches(wiper: WiperSpec, begin_us: float, end_us: float) -> tuple[Fl
 
 
 def background_switches(background: BackgroundSpec, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-    """The same of the background's light: how many times `light_w_m2` it is, in even steps."""
+    """Return changes of the background, as `wiper_switches`: its light in multiples of `light_w_m2`."""
     when, held = [np.empty(0)], [np.array([share for _, share in background.change_s[:1]] or [1.0])]
     for (from_s, first), (to_s, last) in pairwise(background.change_s):
         steps = math.ceil(abs(math.log(last / first)) / _BACKGROUND_STEP_LN)
@@ -397,12 +397,12 @@ def background_switches(background: BackgroundSpec, begin_us: float, end_us: flo
 
 
 def reflections_of(scene: Scene, bar: int) -> tuple[ReflectionSpec, ...]:
-    """The reflections of a bar of a scene."""
+    """Return the reflections of a bar of a scene."""
     return tuple(one for one in scene.reflections if one.bar in (None, bar))
 
 
-def _random_lamps(scene: Scene) -> list[LampSpec]:
-    """Lamps as streets have them, at random places in view: mains lamps, LEDs, signs."""
+def _draw_lamps(scene: Scene) -> list[LampSpec]:
+    """Draw lamps as streets have them, at random places in view: mains lamps, LEDs, signs."""
     rng = np.random.default_rng([scene.seed, 0x1A])
     lamps = []
     for _ in range(scene.flicker_lamps):
@@ -428,14 +428,14 @@ def _random_lamps(scene: Scene) -> list[LampSpec]:
 
 
 def sources_of(scene: Scene, registry: Registry | None = None) -> tuple[list[BarLight], list[Source]]:
-    """The bars and the lamps of a scene, ready to send.
+    """Return the light of the bars and the lamps of a scene.
 
     Args:
         scene: The scene.
-        registry: Where the algorithms of its links are found; None for all that are installed.
+        registry: The algorithms of its links; None for all that are installed.
 
     Raises:
-        ConfigError: A bar cannot send what it should, or its columns are too many.
+        ConfigError: A bar cannot send its payload, or the strips are too many.
         InputError: A file of chips cannot be read.
     """
     links = links_of(scene, registry)
@@ -453,7 +453,7 @@ def sources_of(scene: Scene, registry: Registry | None = None) -> tuple[list[Bar
         )
         for i, (bar, link, site) in enumerate(zip(scene.bars, links, sites, strict=True))
     ]
-    lamps = [lamp_source(lamp) for lamp in (*scene.lamps, *_random_lamps(scene))]
+    lamps = [make_lamp_source(lamp) for lamp in (*scene.lamps, *_draw_lamps(scene))]
     columns = sum(len(bar.strips) + len(bar.images) for bar in bars)
     if columns + len(lamps) > MOST_SOURCES:
         raise ConfigError(

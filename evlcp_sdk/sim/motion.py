@@ -1,4 +1,4 @@
-"""How the camera moves, and where that puts a strip of light in the image."""
+"""Move the camera, and project strips of light into its image."""
 
 import math
 from dataclasses import dataclass
@@ -17,23 +17,23 @@ Floats = NDArray[np.float64]
 
 _SINES = 128
 
-_MOST = 1e6
-"""Size of the largest number of a path: beyond, its splines lose the millimetres."""
+_MOST_VALUE = 1e6
+"""Largest number of a path: beyond, its splines lose millimetres."""
 
 _SHORTEST_S = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Vibration:
-    """Gaussian pitch and yaw rates as a sum of sines, so that any time can be asked for.
+    """Gaussian pitch and yaw rates as a sum of sines, computed at any time.
 
     The spectrum (a guess, after the sensor model): 45 % of the power around 1.5 Hz (the body on its springs),
     40 % around 12 Hz (the wheels), 15 % in a tail that falls with the square of frequency to 200 Hz.
 
     Attributes:
-        frequency_hz: float64 (2, n): of yaw, of pitch.
-        phase: The same shape, radians.
-        amplitude_rad_s: Of each sine of the rate.
+        frequency_hz: Frequencies of yaw and of pitch, float64 (2, n).
+        phase: Phases of the same shape, radians.
+        amplitude_rad_s: Amplitude of each sine of the rate.
     """
 
     frequency_hz: Floats
@@ -42,7 +42,7 @@ class Vibration:
 
     @classmethod
     def of(cls, rate_rad_s: float, seed: int) -> "Vibration":
-        """A vibration whose rates have this rms over long times."""
+        """Draw a vibration whose rates have this rms over long times."""
         rng = np.random.default_rng([seed, 0x71B])
         share = (np.arange(_SINES) + rng.random((2, _SINES))) / _SINES
         body, wheels, tail = share < 0.45, share < 0.85, share >= 0.85
@@ -56,14 +56,14 @@ class Vibration:
         return cls(frequency, phase, rate_rad_s * math.sqrt(2 / _SINES))
 
     def angle_rad(self, t_us: ArrayLike) -> Floats:
-        """Yaw and pitch at times (n,): float64 (2, n)."""
+        """Return yaw and pitch at times (n,), float64 (2, n)."""
         if self.amplitude_rad_s == 0:
             return np.zeros((2, np.size(t_us)))
         scale = self.amplitude_rad_s / (2 * math.pi * self.frequency_hz)
         t_s = np.asarray(t_us, np.float64) * 1e-6
         phase = 2 * math.pi * self.frequency_hz[:, :, None] * t_s + self.phase[:, :, None]
-        turned: Floats = (scale[:, :, None] * np.sin(phase)).sum(1)
-        return turned
+        angles: Floats = (scale[:, :, None] * np.sin(phase)).sum(1)
+        return angles
 
 
 class CameraPath:
@@ -72,7 +72,7 @@ class CameraPath:
     Args:
         motion: The approach, or the file of a path.
         duration_s: How long the path must last.
-        seed: Of the vibration.
+        seed: Seed of the vibration.
 
     Raises:
         InputError: The file cannot be read.
@@ -86,8 +86,8 @@ class CameraPath:
         if motion.path_file is not None:
             self._spline = _read_path(Path(motion.path_file), duration_s)
 
-    def at(self, t_us: ArrayLike) -> tuple[Floats, Floats]:
-        """Positions (n, 3), m, and attitudes (yaw, pitch, roll) (n, 3), radians, at times (n,)."""
+    def sample(self, t_us: ArrayLike) -> tuple[Floats, Floats]:
+        """Return positions (n, 3), m, and attitudes (yaw, pitch, roll) (n, 3), radians, at times (n,)."""
         t_us = np.atleast_1d(np.asarray(t_us, np.float64))
         m = self._motion
         if self._spline is None:
@@ -98,31 +98,30 @@ class CameraPath:
         else:
             values: Floats = self._spline(t_us * 1e-6)
             position, attitude = values[:, :3], np.radians(values[:, 3:])
-        shaken = self._vibration.angle_rad(t_us)
-        attitude[:, 0] += m.vib_yaw_share * shaken[0]
-        attitude[:, 1] += shaken[1]
+        vibration_rad = self._vibration.angle_rad(t_us)
+        attitude[:, 0] += m.vib_yaw_share * vibration_rad[0]
+        attitude[:, 1] += vibration_rad[1]
         if m.pothole_s:
             attitude[:, 1] += pothole_angle_rad(m, t_us)
         return position, attitude
 
 
 def pothole_angle_rad(motion: MotionSpec, t_us: ArrayLike) -> Floats:
-    """Pitch that potholes add at times (n,): after each, a spring's with a damper after a blow.
+    """Return the pitch that potholes add at times (n,): after each, that of a damped spring after a blow.
 
-    A sin(2 pi f t) exp(-t / decay) / (2 pi f): its rate begins with A, `pothole_rad_s`, and it comes to rest
-    where it was.
+    It is A sin(2 pi f t) exp(-t / decay) / (2 pi f), whose rate starts at A, `pothole_rad_s`.
     """
     t_s = np.asarray(t_us, np.float64) * 1e-6
     after = np.maximum(t_s[:, None] - np.array(motion.pothole_s), 0.0)
     turn = 2 * math.pi * motion.pothole_hz
-    rung: Floats = np.sin(turn * after) * np.exp(-after / motion.pothole_decay_s)
-    total: Floats = motion.pothole_rad_s / turn * rung.sum(1)
+    ringing: Floats = np.sin(turn * after) * np.exp(-after / motion.pothole_decay_s)
+    total: Floats = motion.pothole_rad_s / turn * ringing.sum(1)
     return total
 
 
 def _read_path(path: Path, duration_s: float) -> CubicSpline:
     names = ("t_s", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
-    _, columns = read_table(path, dict.fromkeys(names, (-_MOST, _MOST)), {}, rising="t_s")
+    _, columns = read_table(path, dict.fromkeys(names, (-_MOST_VALUE, _MOST_VALUE)), {}, rising="t_s")
     table = np.stack([columns[name] for name in names], 1)
     if len(table) < 2 or (np.diff(table[:, 0]) < _SHORTEST_S).any():
         raise ConfigError(f"{path}: expected two lines or more with rising t_s, {_SHORTEST_S:g} s apart")
@@ -135,11 +134,11 @@ def _read_path(path: Path, duration_s: float) -> CubicSpline:
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """A straight strip of light in the world, cut into clusters from its first end.
+    """A straight strip of light in the scene, cut into clusters from its first end.
 
     Attributes:
         centre_m: x, y, z of its middle.
-        along_m: From its first end to its last.
+        along_m: Vector from its first end to its last.
         width_m: Its width.
         cuts: Where its clusters start and end, shares of its length from -0.5 to 0.5.
     """
@@ -151,11 +150,11 @@ class Strip:
 
     @property
     def clusters(self) -> int:
-        """How many parts it has."""
+        """Number of its clusters."""
         return len(self.cuts) - 1
 
     def cuts_m(self) -> Floats:
-        """Where its clusters start and end: float64 (clusters + 1, 3)."""
+        """Return where its clusters start and end, float64 (clusters + 1, 3)."""
         cuts: Floats = np.asarray(self.centre_m) + np.array(self.cuts)[:, None] * np.asarray(self.along_m)
         return cuts
 
@@ -163,18 +162,18 @@ class Strip:
 def project(
     points_m: Floats, position_m: Floats, attitude_rad: Floats, camera: CameraModel
 ) -> tuple[Floats, Floats]:
-    """Where points fall in the image at several times; the middle of pixel (i, j) is at (i, j).
+    """Project points into the image at several times; the middle of pixel (i, j) is at (i, j).
 
     Args:
-        points_m: float64 (p, 3), m.
-        position_m: The camera's, float64 (n, 3), m.
-        attitude_rad: Its (yaw, pitch, roll), float64 (n, 3): first turned right, then up, then rolled so
-            that its top leans right.
-        camera: With its principal point and distortion.
+        points_m: The points, float64 (p, 3), m.
+        position_m: Positions of the camera, float64 (n, 3), m.
+        attitude_rad: Its (yaw, pitch, roll), float64 (n, 3): first turned right, then up, then rolled with
+            its top to the right.
+        camera: The camera, with its principal point and distortion.
 
     Returns:
-        Places, px, float64 (n, p, 2), and depths along the optical axis, m, float64 (n, p). Places of points
-        nearer than 0.5 m are not to be used.
+        Image points, px, float64 (n, p, 2), not valid closer than 0.5 m; and depths along the optical axis,
+        m, float64 (n, p).
     """
     yaw, pitch, roll = attitude_rad.T[:, :, None]
     offset = points_m[None] - position_m[:, None]

@@ -30,10 +30,10 @@ MOST_PIXELS = 4096
 """Columns and rows of a sensor."""
 
 MOST_SOURCES = 64
-"""Strips of light of one scene: lamps, and columns or rows of LEDs, each again for every reflection."""
+"""Strips of light of one scene: lamps, and columns or rows of LEDs, again for every reflection."""
 
 LinkTable = Mapping[str, Any]
-"""A link, or what is different about it: tables as in `link.toml`."""
+"""A link, or its differences from another: tables as in `link.toml`."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class BarSpec:
     link: Annotated[
         dict[str, Any] | str | None,
         Field(
-            description="What it sends, and how its LEDs stand: a `link.toml`, or tables laid over the"
+            description="What it sends, and the layout of its LEDs: a `link.toml`, or tables laid over the"
             " scene's link; none: the scene's link."
         ),
     ] = None
     width_m: Annotated[
-        float, Field(gt=0, description="Lit width of a column of LEDs; a ring and a table say it themselves.")
+        float, Field(gt=0, description="Lit width of a column of LEDs; a ring and a table have their own.")
     ] = 0.005
     lean_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans to the right.")] = 0.0
     tilt_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans away from the camera.")] = 0.0
@@ -64,11 +64,11 @@ class BarSpec:
     ] = None
     site_off_m: Annotated[
         tuple[float, float, float],
-        Field(description="Its site is said to be so far to the east, north and up of it; it is not."),
+        Field(description="Error of its reported site to the east, north and up."),
     ] = (0.0, 0.0, 0.0)
     site_of: Annotated[
         int | None,
-        Field(ge=0, description="Number of the bar, counted from 0, at whose place its site is said to be."),
+        Field(ge=0, description="Number of the bar, counted from 0, whose site it is reported at."),
     ] = None
     seed: Annotated[int | None, Field(ge=0, description="Seed of its payload; none: the scene's.")] = None
     payload: Annotated[
@@ -97,23 +97,23 @@ class BarSpec:
     ] = ()
     stuck_leds: Annotated[tuple[int, ...], Field(description="LEDs that shine all the time.")] = ()
     led_spread: Annotated[
-        float, Field(ge=0, le=1, description="Sigma of the logarithm of the light of one LED and another.")
+        float, Field(ge=0, le=1, description="Sigma of the logarithm of the light of LEDs.")
     ] = 0.0
     covered: Annotated[
         tuple[int, ...], Field(description="Clusters that are hidden all the time, counted from 0.")
     ] = ()
     cover_s: Annotated[
         tuple[tuple[float, float, int, int], ...],
-        Field(description="What passes: [from s, to s, first cluster, last cluster] that are hidden then."),
+        Field(description="Clusters hidden for a time: [from s, to s, first cluster, last cluster]."),
     ] = ()
     pole_s: Annotated[
-        tuple[tuple[float, float], ...], Field(description="[from s, to s] when all of it is hidden.")
+        tuple[tuple[float, float], ...], Field(description="Times when all of it is hidden: [from s, to s].")
     ] = ()
     lattice_m: Annotated[
         tuple[float, float, float] | None,
         Field(
-            description="Slats of a slanted fence that cross it: [from one to the next, what one hides, from"
-            " its top to where one begins] along it; none: no fence."
+            description="Slats of a slanted fence that cross it: [pitch, width of a slat, from its top to the"
+            " start of a slat] along it; none: no fence."
         ),
     ] = None
     lattice_mps: Annotated[float, Field(ge=-10, le=10, description="How fast they pass down it.")] = 0.0
@@ -123,8 +123,8 @@ class BarSpec:
 class ReflectionSpec:
     """A second image of a bar: upside down in the road, beside it in a rail, or shifted by a window.
 
-    Every image has the bar's chips at the same times. What covers a bar stands in the direct view and covers
-    none of its images.
+    Every image has the bar's chips at the same times. Covers of a bar hide the direct view and none of its
+    images.
     """
 
     kind: Annotated[
@@ -177,7 +177,7 @@ class LampSpec:
 
 @dataclass(frozen=True)
 class LensSpec:
-    """What the lens does beside projecting: its light, its blur, near and far, its halo."""
+    """The lens: its light, its blur, near and far, its halo."""
 
     f_number: Annotated[float, Field(gt=0, description="Focal length over aperture.")] = 2.0
     focus_m: Annotated[float, Field(gt=0, description="Distance that is sharp.")] = 50.0
@@ -237,7 +237,7 @@ class MotionSpec:
 
 @dataclass(frozen=True)
 class WorldSpec:
-    """Where the scene's origin, x_m = y_m = z_m = 0, is on earth, and z points; what an IMU measures."""
+    """Place and heading on earth of the scene's origin; errors of an IMU and of a survey."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90, description="WGS-84.")] = 0.0
     longitude_deg: Annotated[float, Field(ge=-180, le=180, description="The same.")] = 0.0
@@ -253,17 +253,17 @@ class WorldSpec:
     heading_sigma_deg: Annotated[float, Field(ge=0, le=30, description="The same of the heading.")] = 0.1
     attitude_off_deg: Annotated[
         tuple[float, float, float],
-        Field(description="By how much more than that pitch, roll and heading are off."),
+        Field(description="Further error of pitch, roll and heading, unknown to all."),
     ] = (0.0, 0.0, 0.0)
-    attitude_late_ms: Annotated[
-        float, Field(ge=0, le=1000, description="How old the attitude is that is said.")
-    ] = 0.0
+    attitude_late_ms: Annotated[float, Field(ge=0, le=1000, description="Age of the reported attitude.")] = (
+        0.0
+    )
     attitude_errs: Annotated[
-        float, Field(ge=0, le=1000, description="How many times larger its errors are than its sigmas say.")
+        float, Field(ge=0, le=1000, description="Ratio of its errors to its stated sigmas.")
     ] = 1.0
     survey_sigma_m: Annotated[
         float,
-        Field(ge=0, le=1000, description="Error of each site to the east, north and up, which it says."),
+        Field(ge=0, le=1000, description="Stated error of each site to the east, north and up."),
     ] = 0.0
 
 
@@ -277,8 +277,8 @@ class BackgroundSpec:
     change_s: Annotated[
         tuple[tuple[float, Annotated[float, Field(gt=0, le=1e5)]], ...],
         Field(
-            description="[at s, how many times that it is then]: sun through trees, a tunnel's end. Its"
-            " logarithm changes evenly in between; before and after it is as the nearest says."
+            description="[at s, multiple of that light]: sun through trees, a tunnel's end. Its logarithm"
+            " changes evenly in between; before the first and after the last it is constant."
         ),
     ] = ()
     texture: Annotated[
@@ -288,7 +288,7 @@ class BackgroundSpec:
         float, Field(ge=2, le=64, description="Distance at which its correlation is 1 / e; a guess.")
     ] = 12.0
     texture_step_px: Annotated[
-        float, Field(ge=0.1, le=4, description="How far it moves until the light on a pixel follows it.")
+        float, Field(ge=0.1, le=4, description="Motion after which the light on a pixel follows it.")
     ] = 0.8
     around_px: Annotated[
         int,
@@ -296,39 +296,39 @@ class BackgroundSpec:
             ge=0,
             le=MOST_PIXELS,
             description="How far around bars and lamps its own events are simulated, too; 0: only on pixels"
-            " that these light; as many as the image is wide: everywhere.",
+            " that these light; the width of the image: everywhere.",
         ),
     ] = 0
 
 
 @dataclass(frozen=True)
 class DropSpec:
-    """A rain drop on the windscreen, a lens that bends what is seen through it away from its middle.
+    """A rain drop on the windscreen, a lens that deflects light away from its middle.
 
-    A point d px from the middle is seen `bend_px` (d / r) exp((1 - d^2 / r^2) / 2) farther out, r its
-    `radius_px`: by `bend_px`, the most, at its rim.
+    A point d px from the middle is seen `bend_px` (d / r) exp((1 - d^2 / r^2) / 2) farther out, with r its
+    `radius_px`: the most, `bend_px`, at its rim.
     """
 
     x_px: Annotated[float, Field(description="Its middle's column as the scene starts.")]
     y_px: Annotated[float, Field(description="Its row.")]
     radius_px: Annotated[float, Field(gt=0, le=1000, description="From its middle to its rim.")] = 25.0
-    bend_px: Annotated[float, Field(ge=-50, le=50, description="By how much; less than 0: inward.")] = 4.0
+    bend_px: Annotated[float, Field(ge=-50, le=50, description="Deflection; less than 0: inward.")] = 4.0
     speed_px_s: Annotated[
-        tuple[float, float], Field(description="How it runs, to the right and down; in steps of 4 ms.")
+        tuple[float, float], Field(description="Its speed to the right and down; in steps of 4 ms.")
     ] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class WiperSpec:
-    """What takes a share of all light for a time: a wiper's blade before the lens, out of focus."""
+    """A wiper's blade before the lens, out of focus, which takes a share of all light for a time."""
 
     share: Annotated[float, Field(ge=0, le=0.999, description="Share of the light that it takes.")] = 0.0
-    at_s: Annotated[float, Field(ge=0, description="When it first begins to.")] = 0.05
-    lasts_s: Annotated[float, Field(gt=0, description="How long it does, its edges included.")] = 0.03
+    at_s: Annotated[float, Field(ge=0, description="Start of its first pass.")] = 0.05
+    lasts_s: Annotated[float, Field(gt=0, description="Length of a pass, its edges included.")] = 0.03
     edge_s: Annotated[
-        float, Field(ge=0, description="How long the blade's edge takes to pass the lens; a guess.")
+        float, Field(ge=0, description="Time of the blade's edge to pass the lens; a guess.")
     ] = 0.005
-    every_s: Annotated[float, Field(ge=0, description="From one time to the next; 0: only once.")] = 0.0
+    every_s: Annotated[float, Field(ge=0, description="Period of its passes; 0: only one.")] = 0.0
 
 
 @dataclass(frozen=True)
@@ -383,7 +383,7 @@ class Scene:
     """Everything that determines a recording.
 
     Raises:
-        ConfigError: It asks for what cannot be: a bar behind the camera, too many sources.
+        ConfigError: It is not possible, e.g. with a bar behind the camera, or too many sources.
 
     >>> len(Scene().bars)
     1
@@ -454,16 +454,16 @@ _LISTS = ("bars", "reflections", "lamps", "drops")
 
 
 def preset_names() -> list[str]:
-    """Names of the scenes that come with the package."""
+    """Return the names of the scenes that come with the package."""
     folder = resources.files("evlcp_sdk.sim") / "presets"
     return sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml"))
 
 
 def preset_text(name: str) -> str:
-    """The TOML of a preset.
+    """Return the TOML of a preset.
 
     Raises:
-        ConfigError: There is none of that name.
+        ConfigError: There is no preset of that name.
     """
     known = preset_names()
     if name not in known:
@@ -486,7 +486,7 @@ def load_scene(
             of every bar, `bars.1.ppm` that of the second, `duration_s` a key without a table;
             `link.air.chip_rate_hz` is a key of the scene's link, `bars.1.link.air.chip_rate_hz` one of the
             second bar's.
-        registry: Where the algorithms of its links are found; None for all that are installed.
+        registry: The algorithms of its links; None for all that are installed.
         link: A link, or a `link.toml`, instead of the scene's link.
 
     Raises:
@@ -509,11 +509,11 @@ def load_scene(
             )
         table = read_toml(path)
     if link is not None:
-        table["link"] = _Whole(link.table) if isinstance(link, Link) else _Whole.read(link)
+        table["link"] = _FileLink(link.table) if isinstance(link, Link) else _FileLink.read(link)
     _read_links(table, folder, f"{where}: ")
     pairs = overrides.items() if isinstance(overrides, Mapping) else map(_parse_override, overrides)
     for key, value in pairs:
-        _set(table, key, value)
+        _set_value(table, key, value)
         _read_links(table, folder, "--set ")
     return resolve_scene(table, registry, source=where, folder=folder)
 
@@ -525,33 +525,33 @@ def resolve_scene(
     source: str = "",
     folder: Path | None = None,
 ) -> Scene:
-    """Check a scene's table, with every default; its files of links are read, and each bar has its own.
+    """Check the table of a scene, fill in defaults, and read files of links, so that each bar has its own.
 
     Args:
-        table: As read from TOML.
-        registry: Where the algorithms of its links are found; None for all that are installed.
-        source: What faults name as their place.
-        folder: What `path_file`, `chips_file` and the files of links are relative to; None for the current
-            folder.
+        table: The table, as read from TOML.
+        registry: The algorithms of its links; None for all that are installed.
+        source: Name of the scene in error messages.
+        folder: The folder that `path_file`, `chips_file` and files of links are relative to; None for the
+            current one.
 
     Raises:
         ConfigError: One line per fault, each with its path.
     """
-    before = f"{source}: " if source else ""
+    prefix = f"{source}: " if source else ""
     table = dict(table)
-    default = _give_links(table, folder, before)
+    default = _distribute_links(table, folder, prefix)
     if default:
-        _resolve_link(default, registry, f"{before}link")
+        _resolve_link(default, registry, f"{prefix}link")
     bars = table.get("bars")
     for i, bar in enumerate(bars if isinstance(bars, list) else []):
-        if isinstance(bar, dict) and isinstance(bar.get("link"), _Whole):
-            _resolve_link(bar["link"], registry, f"{before}bars.{i}.link")
+        if isinstance(bar, dict) and isinstance(bar.get("link"), _FileLink):
+            _resolve_link(bar["link"], registry, f"{prefix}bars.{i}.link")
     try:
-        scene = build_spec(Scene, table, hint=_hint)
+        scene = build_spec(Scene, table, hint=_hint_at_link)
     except SpecError as refused:
-        raise ConfigError("\n".join(refused.lines(before))) from refused
+        raise ConfigError("\n".join(refused.lines(prefix))) from refused
     except ConfigError as refused:
-        raise ConfigError(f"{before}{refused}") from refused
+        raise ConfigError(f"{prefix}{refused}") from refused
     if folder is not None:
         # File names are relative to the scene's own folder.
         path = scene.motion.path_file and str(folder / scene.motion.path_file)
@@ -564,70 +564,70 @@ def resolve_scene(
 
 
 def links_of(scene: Scene, registry: Registry | None = None, *, source: str = "") -> tuple[Link, ...]:
-    """The link of each bar, resolved.
+    """Return the resolved link of each bar.
 
     Args:
         scene: The scene.
-        registry: Where the algorithms are found; None for all that are installed.
-        source: What faults name as their place.
+        registry: The algorithms of its links; None for all that are installed.
+        source: Name of the scene in error messages.
 
     Raises:
         ConfigError: A bar's link is not valid; one line per fault.
     """
-    before = f"{source}: " if source else ""
+    prefix = f"{source}: " if source else ""
     table: dict[str, Any] = {"link": scene.link, "bars": [{"link": bar.link} for bar in scene.bars]}
-    _give_links(table, None, before)
+    _distribute_links(table, None, prefix)
     return tuple(
-        _resolve_link(bar.get("link") or {}, registry, f"{before}bars.{i}.link")
+        _resolve_link(bar.get("link") or {}, registry, f"{prefix}bars.{i}.link")
         for i, bar in enumerate(table["bars"])
     )
 
 
 def _resolve_link(table: LinkTable, registry: Registry | None, where: str) -> Link:
     try:
-        return _resolved(json.dumps(table, default=str), registry)
+        return _resolve_text(json.dumps(table, default=str), registry)
     except ConfigError as refused:
-        if isinstance(table, _Whole) and table.file:
+        if isinstance(table, _FileLink) and table.file:
             where = f"{where}: {table.file}"
         lines = (f"{where}: {line}" for line in str(refused).splitlines())
         raise ConfigError("\n".join(lines)) from refused
 
 
 @lru_cache(maxsize=64)
-def _resolved(text: str, registry: Registry | None) -> Link:
+def _resolve_text(text: str, registry: Registry | None) -> Link:
     return resolve(json.loads(text), registry)
 
 
-class _Whole(dict[str, Any]):
-    """A link from a file: it stands for itself and is not laid over another; faults name its file."""
+class _FileLink(dict[str, Any]):
+    """A link from a file, which is not laid over another; errors name its file."""
 
     file = ""
 
     @classmethod
-    def read(cls, path: Path | str) -> "_Whole":
-        whole = cls(load_led_file(read_toml(path), Path(path).parent, f"{path}: "))
-        whole.file = str(path)
-        return whole
+    def read(cls, path: Path | str) -> "_FileLink":
+        link = cls(load_led_file(read_toml(path), Path(path).parent, f"{path}: "))
+        link.file = str(path)
+        return link
 
 
-def _read_links(table: dict[str, Any], folder: Path | None, before: str) -> None:
-    """Put the tables of files of links in their places."""
+def _read_links(table: dict[str, Any], folder: Path | None, prefix: str) -> None:
+    """Replace the names of files of links by their tables."""
 
     def read(holder: dict[str, Any], where: str) -> None:
         link = holder.get("link")
         if isinstance(link, str):
             try:
-                holder["link"] = _Whole.read(link if folder is None else folder / link)
+                holder["link"] = _FileLink.read(link if folder is None else folder / link)
             except ConfigError as fault:
-                raise ConfigError(f"{before}{where}: {fault}") from fault
+                raise ConfigError(f"{prefix}{where}: {fault}") from fault
         elif isinstance(link, Mapping):
-            whole = load_led_file(link, folder or Path(), f"{before}{where}: ")
-            if isinstance(link, _Whole):
-                link.update(whole)
+            complete = load_led_file(link, folder or Path(), f"{prefix}{where}: ")
+            if isinstance(link, _FileLink):
+                link.update(complete)
             else:
-                holder["link"] = whole
+                holder["link"] = complete
         elif link is not None:
-            raise ConfigError(f"{before}{where} = {link!r}: expected a link.toml, or tables as in one")
+            raise ConfigError(f"{prefix}{where} = {link!r}: expected a link.toml, or tables as in one")
 
     read(table, "link")
     bars = table.get("bars")
@@ -636,41 +636,39 @@ def _read_links(table: dict[str, Any], folder: Path | None, before: str) -> None
             read(bar, f"bars.{i}.link")
 
 
-def _give_links(table: dict[str, Any], folder: Path | None, before: str) -> LinkTable | None:
-    """Move the scene's link into those of its bars, so that each says all of its own; return it."""
+def _distribute_links(table: dict[str, Any], folder: Path | None, prefix: str) -> LinkTable | None:
+    """Merge the scene's link into those of its bars, which are then complete; return it."""
     bars = table.get("bars")
     if table.get("link") is not None and bars is None:
         bars = [{}]
     if isinstance(bars, list | tuple):
         table["bars"] = [dict(bar) if isinstance(bar, Mapping) else bar for bar in bars]
-    _read_links(table, folder, before)
+    _read_links(table, folder, prefix)
     default: LinkTable | None = table.pop("link", None)
     if default is not None and isinstance(table["bars"], list):
         for bar in table["bars"]:
-            if isinstance(bar, dict) and not isinstance(bar.get("link"), _Whole):
-                bar["link"] = _laid_over(default, bar.get("link") or {})
+            if isinstance(bar, dict) and not isinstance(bar.get("link"), _FileLink):
+                bar["link"] = _merge_links(default, bar.get("link") or {})
     return default
 
 
-def _laid_over(under: LinkTable, over: LinkTable) -> dict[str, Any]:
-    """Two links' tables in one, section by section; another algorithm, or shape of the bar, brings its
-    own parameters.
-    """
+def _merge_links(under: LinkTable, over: LinkTable) -> dict[str, Any]:
+    """Lay one link over another by sections; another algorithm or shape of the bar replaces its section."""
     found = dict(under)
     for section, keys in over.items():
         below = under.get(section, {})
         if not isinstance(keys, Mapping) or not isinstance(below, Mapping):
             found[section] = keys
             continue
-        what, default = ("shape", "grid") if section == "bar" else ("id", None)
+        name, default = ("shape", "grid") if section == "bar" else ("id", None)
         if section in ROLES:
             default = ROLES[section].default
-        same = keys.get(what, below.get(what, default)) == below.get(what, default)
-        found[section] = {**below, **keys} if same else dict(keys)
+        is_same = keys.get(name, below.get(name, default)) == below.get(name, default)
+        found[section] = {**below, **keys} if is_same else dict(keys)
     return found
 
 
-_IN_LINK = {
+_LINK_KEYS = {
     "clusters": "bar.rows, bar.cluster_rows",
     "leds": "bar.leds",
     "shape": "bar.shape",
@@ -682,12 +680,12 @@ _IN_LINK = {
     "chip_rate_hz": "air.chip_rate_hz",
     "error_correction": "error-correction.id",
 }
-"""What one looks for at a bar, and the keys of its link."""
+"""Keys that one may expect in a bar, and those of its link that have them."""
 
 
-def _hint(path: tuple[str, ...]) -> str | None:
-    """What to say of an unknown key that a bar's link has."""
-    instead = _IN_LINK.get(path[-1]) if path[0] == "bars" else None
+def _hint_at_link(path: tuple[str, ...]) -> str | None:
+    """Return where an unknown key of a bar is in its link."""
+    instead = _LINK_KEYS.get(path[-1]) if path[0] == "bars" else None
     return f"; its link says it: bars.link.{instead}" if instead else None
 
 
@@ -698,7 +696,7 @@ def _parse_override(text: str) -> tuple[str, Any]:
     return key.strip(), parse_value(value)
 
 
-def _set(table: dict[str, Any], key: str, value: Any) -> None:
+def _set_value(table: dict[str, Any], key: str, value: Any) -> None:
     if isinstance(value, np.generic):
         value = value.item()
     head, *rest = key.split(".")
@@ -718,15 +716,14 @@ def _set(table: dict[str, Any], key: str, value: Any) -> None:
             holders = [rows[int(number)]]
     for holder in holders:
         if rest[0] == "link" and len(rest) > 1 and head in ("link", "bars"):
-            _set_link(holder, rest[1:], value, key)
+            _set_link_value(holder, rest[1:], value, key)
         elif len(rest) == 1 and head in (key, *_TABLES, *_LISTS):
             holder[rest[0]] = value
         else:
             raise ConfigError(f"--set {key}: unknown table{suggest(head, [*_TABLES, *_LISTS, 'link'])}")
 
 
-def _set_link(holder: dict[str, Any], parts: Sequence[str], value: Any, key: str) -> None:
-    """Set a key of the link of a scene or a bar."""
+def _set_link_value(holder: dict[str, Any], parts: Sequence[str], value: Any, key: str) -> None:
     if len(parts) > 2:
         raise ConfigError(f"--set {key}: expected link.TABLE.KEY, e.g. link.air.chip_rate_hz")
     link = holder.get("link")

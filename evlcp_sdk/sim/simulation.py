@@ -1,4 +1,4 @@
-"""The simulator: a scene in, events out, block by block of time in constant memory."""
+"""Render a scene to events, block by block of time in constant memory."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -18,26 +18,26 @@ from evlcp_sdk.scene.optics import Blur, blurred_edge
 from evlcp_sdk.sim import _kernels
 from evlcp_sdk.sim.light import Source, background_switches, cut_changes, sources_of, wiper_switches
 from evlcp_sdk.sim.motion import CameraPath, project
-from evlcp_sdk.sim.optics import blur_of, strip_table, unbent
+from evlcp_sdk.sim.optics import blur_of, tabulate_strip, undo_drops
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
 from evlcp_sdk.values import Events
 
 Floats = NDArray[np.float64]
 
 _Requests = tuple[Floats, NDArray[np.int32]]
-"""Requests of pixels to be read out: their times, us, and their codes."""
+"""Readout requests of pixels: times, us, and codes."""
 
 ACTIVITY_FLOOR = 0.1
-"""Log signal by which a source must be able to move a pixel for the pixel to be simulated, ln units."""
+"""Least change of the log signal by a source for a pixel to be simulated, ln units."""
 
 MOTION_STEP_PX = 0.1
-"""How far the image moves before the light on the pixels is computed anew, px."""
+"""Motion of the image after which the light on the pixels is computed again, px."""
 
 _CELL_US = 1000.0
 _CELLS = 4
 _BLOCK_US = _CELLS * _CELL_US
 _STRETCH = 8  # blocks
-_FAR_PX = (3.0, 6.0, 12.0)  # whence the image moves twice as far before the light is computed anew
+_FAR_PX = (3.0, 6.0, 12.0)  # distances beyond each of which the motion step doubles
 _SAME_DEPTH = 0.0026  # of the depth
 _MOST_MOVES = 40
 _MOST_MOVES_STRUCK = 400
@@ -51,8 +51,8 @@ _TEXTURE_SIZE = 512
 _MASK64 = 2**64 - 1
 
 
-def sensor_vector(sensor: SensorSpec) -> Floats:
-    """What the kernels need of a sensor, float64 (13,): see `_kernels`."""
+def pack_sensor(sensor: SensorSpec) -> Floats:
+    """Pack the parameters of a sensor for the kernels, float64 (13,)."""
     s = sensor
     widest = math.exp(_kernels.NOISE_LIMIT * s.noise_ln)
     return np.array(
@@ -63,39 +63,39 @@ def sensor_vector(sensor: SensorSpec) -> Floats:
     )
 
 
-def quantile_table(nodes: int = 4097) -> Floats:
-    """Quantiles of the normal distribution between its cut-offs, evenly spaced in probability."""
+def tabulate_quantiles(nodes: int = 4097) -> Floats:
+    """Tabulate the quantiles of the cut-off normal distribution at even steps of probability."""
     edge = ndtr(-_kernels.NOISE_LIMIT)
     table: Floats = ndtri(edge + np.linspace(0, 1, nodes) * (1 - 2 * edge))
     return table
 
 
 def seed_key(seed: int) -> np.uint64:
-    """A seed as the key of the kernels' hash."""
+    """Return the key of the kernels' hash for a seed."""
     return np.uint64((seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019) & _MASK64)
 
 
-def request_words(t_us: Floats, code: NDArray[np.int32], begin_us: float) -> NDArray[np.int64]:
-    """Requests as words, their times since `begin_us` to the nearest tick, int64 (n,)."""
+def pack_requests(t_us: Floats, code: NDArray[np.int32], begin_us: float) -> NDArray[np.int64]:
+    """Pack requests into words, with their times since `begin_us` to the nearest tick, int64 (n,)."""
     ticks = np.rint((t_us - begin_us) * _kernels.TICKS).astype(np.int64)
     words: NDArray[np.int64] = ticks << _kernels.CODE_BITS | code
     return words
 
 
-def _texture(scene: Scene) -> Floats:
-    """Background light relative to its mean: a periodic log-normal field, float64 (512, 512)."""
+def _draw_texture(scene: Scene) -> Floats:
+    """Draw the background light relative to its mean: a periodic log-normal field, float64 (512, 512)."""
     n = _TEXTURE_SIZE
     rng = np.random.default_rng([scene.seed, 0x7E])
-    # White noise behind a Gaussian, drawn where that lets anything pass: within 9 of its sigmas.
+    # White noise through a Gaussian filter, drawn within 9 of its sigmas.
     sigma = 1 / (math.pi * scene.background.texture_px)
     k = min(n // 2 - 1, math.ceil(9 * sigma * n))
     rows = np.arange(-k, k + 1)
     noise = rng.normal(size=(2, 2 * k + 1, k + 1))
-    passed = np.exp(-0.5 * (rows[:, None] ** 2 + rows[None, k:] ** 2) / (sigma * n) ** 2)
-    # Of the waves that do not change along a row each is drawn together with its own opposite.
-    passed[:, 0] *= math.sqrt(2)
+    gain = np.exp(-0.5 * (rows[:, None] ** 2 + rows[None, k:] ** 2) / (sigma * n) ** 2)
+    # Components that are constant along a row are drawn together with their opposites.
+    gain[:, 0] *= math.sqrt(2)
     spectrum = np.zeros((n, n // 2 + 1), complex)
-    spectrum[rows, : k + 1] = (noise[0] + 1j * noise[1]) * passed
+    spectrum[rows, : k + 1] = (noise[0] + 1j * noise[1]) * gain
     log_light = np.fft.irfft2(spectrum, s=(n, n))
     log_light -= log_light.mean()
     log_light *= scene.background.texture / log_light.std()
@@ -103,10 +103,10 @@ def _texture(scene: Scene) -> Floats:
     return np.ascontiguousarray(light / light.mean())
 
 
-def _merge(
+def _merge_pixels(
     marked: list[NDArray[np.int64]], far: list[NDArray[np.uint8]]
 ) -> tuple[NDArray[np.int32], NDArray[np.uint64], NDArray[np.uint8]]:
-    """All pixels of several lists, sorted, each with the lists that it is in and its least distance."""
+    """Merge lists of pixels: sorted pixels, a bit mask of the lists of each, and its least distance."""
     if not marked:
         return np.empty(0, np.int32), np.empty(0, np.uint64), np.empty(0, np.uint8)
     pixels, beyond = np.concatenate(marked), np.concatenate(far)
@@ -126,11 +126,11 @@ class _Halo:
 
     Attributes:
         share: Share of the light.
-        reach_px: How far it is sampled around an edge.
-        nodes_px: Where, float64 (1025,).
-        table: Share of a pixel lit beyond an edge, float64 (1025,), at -reach_px to reach_px.
-        per_px: Samples a pixel along a strip.
-        every: Poses after which its place in the image is computed anew; 0: it stays for a block of time.
+        reach_px: How far around an edge it is sampled.
+        nodes_px: The samples, -reach_px to reach_px, float64 (1025,).
+        table: Share of a pixel lit beyond an edge at each of them, float64 (1025,).
+        per_px: Samples per pixel along a strip.
+        every: Poses after which it is placed in the image again; 0 for once in a block of time.
     """
 
     share: float
@@ -146,19 +146,19 @@ class _Halo:
         nodes = np.linspace(-reach, reach, _WIDE_NODES)
         return cls(share, reach, nodes, blurred_edge(nodes, sigma_px), 8 / sigma_px, every)
 
-    def step(self, at_px: Floats) -> Floats:
-        """Share of a pixel lit that is so far beyond an edge."""
+    def edge_share(self, at_px: Floats) -> Floats:
+        """Return the share of a pixel lit at a distance beyond an edge."""
         return np.interp(at_px, self.nodes_px, self.table)
 
-    def along(self, cuts_px: Floats) -> Floats:
-        """Share of each cluster's light, float64 (clusters, n), along a strip with these cuts."""
+    def cluster_shares(self, cuts_px: Floats) -> Floats:
+        """Return the share of each cluster's light along a strip with these cuts, float64 (clusters, n)."""
         grid = np.arange(-self.reach_px, cuts_px[-1] + self.reach_px, 1 / self.per_px)
-        edge = self.step(grid[:, None] - cuts_px)
-        found: Floats = (edge[:, :-1] - edge[:, 1:]).T
-        return found
+        edge = self.edge_share(grid[:, None] - cuts_px)
+        shares: Floats = (edge[:, :-1] - edge[:, 1:]).T
+        return shares
 
 
-def _time_line(
+def _make_time_line(
     starts_us: Floats,
     wiped: tuple[Floats, Floats],
     changed_us: Floats,
@@ -167,17 +167,17 @@ def _time_line(
     halos_of: list[list[Floats]],
     most: int,
 ) -> tuple[_kernels.TimeLine, Floats, Floats]:
-    """When the light changes in a block, and what the sources show then.
+    """Merge the changes of light in a block into one time line, with the levels of the sources.
 
     Args:
-        starts_us: When each pose begins, the block's begin first, float64 (poses,).
-        wiped: When the share of all light that passes changes, float64 (n,), and that share, from the block's
-            begin on, float64 (n + 1,).
-        changed_us: When the background's light changes.
-        switches: When each source switches, float64 (m,).
-        levels_of: Levels of its clusters, from the block's begin on, float64 (m + 1, clusters).
+        starts_us: Start of each pose, the block's first, float64 (poses,).
+        wiped: Times at which the share of all light that passes changes, float64 (n,), and the shares from
+            the block's start on, float64 (n + 1,).
+        changed_us: Times at which the background's light changes.
+        switches: Times at which each source switches, float64 (m,).
+        levels_of: Levels of its clusters, from the block's start on, float64 (m + 1, clusters).
         halos_of: Its light in each halo on a grid, float64 (m + 1, places), halo by halo.
-        most: Clusters of the source with the most.
+        most: Most clusters of a source.
 
     Returns:
         The time line, the levels of `Strips`, and the light of `Halos`.
@@ -185,7 +185,7 @@ def _time_line(
     sources = len(switches)
     parts = [starts_us, wiped[0], changed_us, *switches]
     when = np.concatenate(parts)
-    # What an entry is: a pose, a wiper's step, one of the background, or a switch of the source of a number.
+    # Kinds of entries: a pose, a step of the wiper or of the background, or a source that switches.
     kind = np.repeat([-2, -1, -3, *range(sources)], [len(part) for part in parts])
     order = np.argsort(when, kind="stable")
     when, kind = when[order], kind[order]
@@ -207,12 +207,12 @@ def _time_line(
     return line, levels, halo
 
 
-def _batches(
+def _make_batches(
     pixels: NDArray[np.int32], masks: NDArray[np.uint64], far: NDArray[np.uint8], most_poses: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.uint64], NDArray[np.int64]]:
-    """Put together pixels that the same sources light, about as near.
+    """Batch pixels that the same sources light from similar distances.
 
-    They see where the sources are anew after `most_poses` at the latest.
+    They follow the motion of the sources every `most_poses` at least.
 
     Returns:
         Pixels, batches, masks and strides of `ActivePixels`.
@@ -227,23 +227,23 @@ def _batches(
     cuts = np.flatnonzero(masks[1:] != masks[:-1]) + 1
     edges = [0, *cuts.tolist(), len(pixels)]
     begins = np.concatenate([np.arange(a, b, _kernels.LANES) for a, b in pairwise(edges)])
-    # The first of a batch is the nearest.
+    # The first pixel of a batch is the closest.
     strides = np.minimum(np.int64(1) << far[begins].astype(np.int64), most_poses)
     return pixels, np.append(begins, len(pixels)), masks[begins], strides
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
-    """How a source looks while its depth hardly changes.
+class _Footprint:
+    """The light of a source around its image, at a depth.
 
     Attributes:
-        depth_m: That depth.
+        depth_m: The depth.
         blur: The image of a point.
-        near: Its `strip_table`.
+        near: The table of `tabulate_strip`.
         scale_px: The scale of that.
-        z_px: Distances from its middle across it, or from its end, px, float64 (n,).
-        across: Light of an endless strip so far from its middle, W/m2, float64 (n,).
-        along: Light in the middle of a strip so far before its end, W/m2, float64 (n,).
+        z_px: Distances, px, float64 (n,).
+        across: Light of an endless strip at each from its middle, W/m2, float64 (n,).
+        along: Light in the middle of a strip at each before its end, W/m2, float64 (n,).
         halos: Share of each cluster's light in each halo on a grid, float64 (clusters, places), halo by halo.
     """
 
@@ -257,7 +257,7 @@ class _Look:
     halos: list[Floats]
 
     def reach_px(self, least_w_m2: float) -> tuple[float, float]:
-        """How far across it and before its ends it gives so much light."""
+        """Return how far across it and before its ends it gives this light."""
         across = self.z_px[self.across >= least_w_m2].max(initial=0)
         along = self.z_px[self.along >= least_w_m2].max(initial=0)
         return float(across), float(along)
@@ -265,56 +265,56 @@ class _Look:
 
 @dataclass(frozen=True, eq=False)
 class _Stretch:
-    """How the camera and the sources move and switch in some blocks of time, worked out at once for all.
+    """Motion and switching of the camera and the sources in some blocks of time.
 
     Attributes:
-        begin_us: When it begins.
-        end_us: When it ends.
-        starts_us: When each pose begins, float64 (poses,).
-        attitude: The camera's in the middle of each pose, float64 (poses, 3), radians.
-        seen: Of each source, places and depths by pose; see `project`.
-        sent: Of each source, when it switches and its levels; see `Source.switches`.
-        wiped: The same of the wiper; see `wiper_switches`.
-        changed: The same of the background; see `background_switches`.
+        begin_us: Its start.
+        end_us: Its end.
+        starts_us: Start of each pose, float64 (poses,).
+        attitude: Attitude of the camera in the middle of each pose, float64 (poses, 3), radians.
+        projections: Image points and depths of each source by pose; see `project`.
+        sent: Switching times and levels of each source; see `Source.switches`.
+        wiped: Those of the wiper; see `wiper_switches`.
+        changed: Those of the background; see `background_switches`.
     """
 
     begin_us: float
     end_us: float
     starts_us: Floats
     attitude: Floats
-    seen: list[tuple[Floats, Floats]]
+    projections: list[tuple[Floats, Floats]]
     sent: list[tuple[Floats, Floats]]
     wiped: tuple[Floats, Floats]
     changed: tuple[Floats, Floats]
 
 
-def _between(slope: float, low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """From where to where a line with this slope through 0 is between two heights."""
-    # A level line is never, or always, between them; a slope of nothing stands for its own.
+def _line_between(slope: float, low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Return where a line through 0 with this slope is between two heights."""
+    # A level line is never or always between them; a tiny slope stands for it.
     slope = math.copysign(max(abs(slope), 1e-9), slope)
     return np.minimum(low / slope, high / slope), np.maximum(low / slope, high / slope)
 
 
 _Block = tuple[_kernels.ActivePixels, tuple[Any, ...]]
-"""The active pixels of a block of time, and what they see: arguments of `run_pixels`."""
+"""The active pixels of a block of time, and the light on them, as arguments of `run_pixels`."""
 
 
 class Simulation:
-    """Renders a scene; made once, streamed once.
+    """Renders a scene; streamed once.
 
-    Time passes in blocks of 4 ms. In each, the pixels that a source may excite are run one by one from edge
-    to edge of the light, and their events go, sorted, through the readout. The light on a pixel changes when
-    a source switches and when the image has moved by `MOTION_STEP_PX`; there is no other time step.
+    Time passes in blocks of 4 ms. In each, the pixels that a source may excite are run from edge to edge of
+    the light, and their sorted events go through the readout. The light on a pixel changes when a source
+    switches and when the image has moved by `MOTION_STEP_PX`; there is no other time step.
 
     Args:
-        scene: What to render.
-        seed: Instead of the scene's.
+        scene: The scene.
+        seed: A seed instead of the scene's.
         threads: Threads that share the pixels; the events do not depend on it.
-        registry: Where the algorithms of its links are found; None for all that are installed.
+        registry: The algorithms of its links; None for all that are installed.
 
     Attributes:
         counts: Events written and dropped so far; signal events are counted before the readout.
-        hot_pixels: How many pixels are hot.
+        hot_pixels: Number of hot pixels.
         done_s: How much of the scene is rendered, s.
 
     Raises:
@@ -332,19 +332,19 @@ class Simulation:
         self._sources: list[Source] = [*strips, *self.lamps]
         self.path = CameraPath(scene.motion, scene.duration_s, scene.seed)
         _, depth = project(
-            np.array([bar.centre_m for bar in self.bars]).reshape(-1, 3), *self.path.at([0.0]), scene.camera
+            np.array([bar.centre_m for bar in self.bars]).reshape(-1, 3),
+            *self.path.sample([0.0]),
+            scene.camera,
         )
         for i in np.flatnonzero(depth[0] <= NEAREST_M):
             raise ConfigError(
                 f"bars.{i}: the bar is behind the camera as the scene starts (depth {depth[0, i]:.2f} m)"
             )
         self._threads = max(1, threads)
-        quantiles = quantile_table()
+        quantiles = tabulate_quantiles()
         shifts = np.exp(scene.sensor.noise_ln * quantiles)
-        self._model = _kernels.PixelModel(
-            seed_key(scene.seed), sensor_vector(scene.sensor), quantiles, shifts
-        )
-        self._texture = _texture(scene)
+        self._model = _kernels.PixelModel(seed_key(scene.seed), pack_sensor(scene.sensor), quantiles, shifts)
+        self._texture = _draw_texture(scene)
         self._darkest_texture = float(self._texture.min())
         self._ends_m = np.array([s.strip.cuts_m()[[0, -1]] for s in self._sources]).reshape(-1, 3)
         size = scene.camera.width * scene.camera.height
@@ -354,7 +354,7 @@ class Simulation:
         self.hot_pixels = int(rng.binomial(size, scene.sensor.hot_share))
         self._hot = rng.choice(size, self.hot_pixels, replace=False)
         self._halos = [_Halo.of(scene.lens.halo, scene.lens.halo_px, 0)]
-        # A halo of few pixels follows the image; a wide one changes little while it moves for 4 ms.
+        # A narrow halo follows the image; a wide one changes little in 4 ms.
         self._texture_every = max(1, round(scene.background.texture_step_px / MOTION_STEP_PX))
         if scene.lens.bloom > 0:
             self._halos.append(_Halo.of(scene.lens.bloom, scene.lens.bloom_px, _BLOOM_EVERY))
@@ -371,7 +371,7 @@ class Simulation:
         self.counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
         self.done_s = 0.0
         self._stretch: _Stretch | None = None
-        self._looks: dict[int, _Look] = {}
+        self._footprints: dict[int, _Footprint] = {}
 
     def stream(self) -> Iterator[Events]:
         """Yield the events in order of time, in pieces of up to a block."""
@@ -380,39 +380,38 @@ class Simulation:
             (number, number * _BLOCK_US, min((number + 1) * _BLOCK_US, end_us))
             for number in range(math.ceil(end_us / _BLOCK_US))
         ]
-        served = _Served(self)
-        # While the pixels of a block run, the next is prepared, and the last one's events are read out.
+        readout = _Readout(self)
+        # While the pixels of a block run, the next is prepared, and the events of the last are read out.
         with ThreadPoolExecutor(self._threads) as pool:
-            ahead = pool.submit(self._prepare, *spans[0])
-            behind: Future[Events] | None = None
+            prepared = pool.submit(self._prepare_block, *spans[0])
+            served: Future[Events] | None = None
             for number, begin, end in spans:
-                block = ahead.result()
+                block = prepared.result()
                 if end < end_us:
-                    ahead = pool.submit(self._prepare, *spans[number + 1])
-                running = [pool.submit(job) for job in self._jobs(block, begin, end)]
-                # Whoever takes the events works beside the pixels.
-                if behind is not None:
-                    yield from self._given(behind.result(), begin)
+                    prepared = pool.submit(self._prepare_block, *spans[number + 1])
+                running = [pool.submit(job) for job in self._make_jobs(block, begin, end)]
+                # The caller handles the events while the pixels run.
+                if served is not None:
+                    yield from self._publish(served.result(), begin)
                 signal = [part for one in running for part in one.result()]
-                behind = pool.submit(served.of, number, end, signal)
-            if behind is not None:
-                yield from self._given(behind.result(), end_us)
+                served = pool.submit(readout.read_block, number, end, signal)
+            if served is not None:
+                yield from self._publish(served.result(), end_us)
 
-    def _given(self, events: Events, end_us: float) -> Iterator[Events]:
-        """The events up to `end_us`, if there are any."""
+    def _publish(self, events: Events, end_us: float) -> Iterator[Events]:
         self.done_s = end_us * 1e-6
         if len(events):
             yield events
 
-    def noise(self, number: int, begin_us: float, end_us: float) -> tuple[Floats, NDArray[np.int32]]:
-        """Background activity and hot pixels from `begin_us` to `end_us`: Poisson events, times and codes."""
+    def draw_noise(self, number: int, begin_us: float, end_us: float) -> tuple[Floats, NDArray[np.int32]]:
+        """Draw Poisson events of the background and of hot pixels between two times: times and codes."""
         camera, sensor = self.scene.camera, self.scene.sensor
         size = camera.width * camera.height
-        # As `hash_normal` does: numbers of a block, a draw and a purpose.
+        # A key of the block, a draw and a purpose, as in `hash_normal`.
         mix, key = cast(Any, _kernels.mix).py_func, np.array([self._model.seed])
         key = mix(key + np.uint64(number) * np.array([_kernels.PIXEL_STEP], np.uint64))
         times, codes = [np.empty(0)], [np.empty(0, np.int64)]
-        for purpose, rate_hz, among in (
+        for purpose, rate_hz, population in (
             (10, 2 * sensor.noise_hz * size, size),
             (13, sensor.hot_hz * len(self._hot), len(self._hot)),
         ):
@@ -422,29 +421,29 @@ class Simulation:
                 continue
             draws = np.arange(int(expected + 12 * math.sqrt(expected) + 64), dtype=np.uint64)
             words = key + draws * np.uint64(_kernels.DRAW_STEP)
-            gap, which, sign = (
+            gap, place, sign = (
                 (mix(words + np.uint64(purpose + k)) >> np.uint64(11)) / 2**53 for k in range(3)
             )
             t = np.cumsum(np.append(begin_us, -np.log(1.0 - gap) / rate))[1:]
             t = t[t < end_us]
-            pixel = (which[: len(t)] * among).astype(np.int64)
+            pixel = (place[: len(t)] * population).astype(np.int64)
             pixel = pixel if purpose == 10 else self._hot[pixel]
             row, column = np.divmod(pixel, camera.width)
             times.append(t)
             codes.append((row << _kernels.COLUMN_BITS | column) << 1 | (sign[: len(t)] < 0.5))
         return np.concatenate(times), np.concatenate(codes).astype(np.int32)
 
-    def _jobs(
+    def _make_jobs(
         self, block: _Block | None, begin_us: float, end_us: float
     ) -> list[Callable[[], list[_Requests]]]:
-        """What runs the active pixels through a block, in parts; each returns their requests, unsorted."""
+        """Return jobs that run parts of the active pixels through a block and return unsorted requests."""
         if block is None:
             return []
         active, world = block
         most = int((end_us - begin_us) / self.scene.sensor.refr_us) + 8
         cuts = [0, len(active.masks)]
         if self._threads > 1:
-            # Ever smaller, so that all threads are done at about the same time.
+            # Ever smaller parts let all threads finish at about the same time.
             left = (1 - 0.5 / self._threads) ** np.arange(_PARTS * self._threads)
             cuts = (len(active.masks) * np.append(1 - left, 1)).astype(int).tolist()
         store = self._state, self._counters, self.scene.camera.width
@@ -461,23 +460,23 @@ class Simulation:
 
         return [partial(run, a, b) for a, b in pairwise(cuts) if a < b]
 
-    def _moves(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-        """When the image has moved by a step: starts and middles of the poses, us, float64 (n,)."""
+    def _choose_poses(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+        """Return starts and middles of poses, in which the image moves by one step, us, float64 (n,)."""
         cells = np.append(np.arange(begin_us, end_us, _CELL_US), end_us)
         t = np.linspace(cells[:-1], cells[1:], 3, axis=1)
-        position, attitude = self.path.at(t.ravel())
-        turned = np.diff(attitude[:, :2].reshape(-1, 3, 2), axis=1)
-        moved = np.abs(turned).max((1, 2)) * self.scene.camera.focal_px
+        position, attitude = self.path.sample(t.ravel())
+        turns = np.diff(attitude[:, :2].reshape(-1, 3, 2), axis=1)
+        moved = np.abs(turns).max((1, 2)) * self.scene.camera.focal_px
         if len(self._ends_m):
             place, depth = project(self._ends_m, position, attitude, self.scene.camera)
             shown = (depth > NEAREST_M) & (np.abs(place) < 4 * self.scene.camera.width).all(2)
-            # An end counts in the blocks in which it is in view all the time.
+            # The end of a strip counts in the blocks in which it is always in view.
             blocks = np.arange(0, len(t), _CELLS)
             counts = np.logical_and.reduceat(shown.reshape(len(t), 3, -1).all(1), blocks)
             step = np.diff(place.reshape(len(t), 3, -1, 2), axis=1)
             length = np.hypot(step[..., 0], step[..., 1]).max(1)
-            seen = np.where(counts[np.arange(len(t)) // _CELLS], length, 0.0)
-            moved = np.maximum(moved, seen.max(1))
+            project_source = np.where(counts[np.arange(len(t)) // _CELLS], length, 0.0)
+            moved = np.maximum(moved, project_source.max(1))
         motion = self.scene.motion
         most = _MOST_MOVES_STRUCK if motion.pothole_s or motion.yaw_rate_deg_s else _MOST_MOVES
         moves = np.clip(np.ceil(2 * moved / MOTION_STEP_PX), 1, most).astype(int)
@@ -487,33 +486,33 @@ class Simulation:
         middles = 0.5 * (starts + np.append(starts[1:], end_us))
         return starts, middles
 
-    def _look(self, source: Source, depth_m: float, strip_px: float, cuts_px: Floats) -> _Look:
-        """How a source looks at this depth, where its clusters start and end so far along it."""
+    def _make_footprint(self, source: Source, depth_m: float, strip_px: float, cuts_px: Floats) -> _Footprint:
+        """Compute the light around a source at a depth, with its clusters cut at these places along it."""
         scene = self.scene
         blur = blur_of(depth_m, scene.lens, scene.camera, source.image.blur_px if source.image else 0.0)
         scale = _NEAR_SCALE * float(blur.sigma_px[0])
-        near = strip_table(blur, strip_px, scale, _NEAR_NODES)
+        near = tabulate_strip(blur, strip_px, scale, _NEAR_NODES)
         z = np.arange(0, self._wide_reach, 0.25)
         half = strip_px / 2
         node, nodes = _NEAR_NODES * z / (z + scale), np.arange(_NEAR_NODES + 1)
         across = self._near_share * np.interp(node, nodes, near[:, -1])
         along = self._near_share * np.interp(node, nodes, near[0, _NEAR_NODES::-1])
         for halo in self._halos:
-            part = halo.step(z + half) - halo.step(z - half)
+            part = halo.edge_share(z + half) - halo.edge_share(z - half)
             across += halo.share * part
-            along += halo.share * part[0] * halo.step(-z)
+            along += halo.share * part[0] * halo.edge_share(-z)
         light = source.light_w_m2
-        halos = [halo.along(cuts_px) for halo in self._halos]
-        return _Look(depth_m, blur, near, scale, z, light * across, light * along, halos)
+        halos = [halo.cluster_shares(cuts_px) for halo in self._halos]
+        return _Footprint(depth_m, blur, near, scale, z, light * across, light * along, halos)
 
-    def _stretch_at(self, begin_us: float) -> _Stretch:
-        """The stretch of time with the block that begins then."""
+    def _get_stretch(self, begin_us: float) -> _Stretch:
+        """Return the stretch with the block that starts at this time."""
         if self._stretch is None or not self._stretch.begin_us <= begin_us < self._stretch.end_us:
-            # A pothole moves the image so often that one block is enough to work out together.
+            # A pothole moves the image so fast that one block has poses enough.
             blocks = 1 if self.scene.motion.pothole_s else _STRETCH
             end_us = min(begin_us + blocks * _BLOCK_US, self.scene.duration_s * 1e6)
-            starts, middles = self._moves(begin_us, end_us)
-            position, attitude = self.path.at(middles)
+            starts, middles = self._choose_poses(begin_us, end_us)
+            position, attitude = self.path.sample(middles)
             wiped = np.empty(0), np.ones(1)
             if self.scene.wiper.share > 0:
                 wiped = wiper_switches(self.scene.wiper, begin_us, end_us)
@@ -522,17 +521,17 @@ class Simulation:
                 end_us,
                 starts,
                 attitude,
-                [self.seen(source, position, attitude) for source in self._sources],
+                [self.project_source(source, position, attitude) for source in self._sources],
                 [source.switches(begin_us, end_us) for source in self._sources],
                 wiped,
                 background_switches(self.scene.background, begin_us, end_us),
             )
         return self._stretch
 
-    def _prepare(self, number: int, begin_us: float, end_us: float) -> _Block | None:
-        """Where the sources are in a block, how they switch, and which pixels they may excite."""
+    def _prepare_block(self, number: int, begin_us: float, end_us: float) -> _Block | None:
+        """Prepare a block: the sources' places and switching, and the pixels that they may excite."""
         scene = self.scene
-        camera, sensor, stretch = scene.camera, scene.sensor, self._stretch_at(begin_us)
+        camera, sensor, stretch = scene.camera, scene.sensor, self._get_stretch(begin_us)
         of_block = slice(*np.searchsorted(stretch.starts_us, (begin_us, end_us)))
         starts, attitude = stretch.starts_us[of_block], stretch.attitude[of_block]
         turn = np.stack([attitude[:, 0], -attitude[:, 1]], 1) * camera.focal_px
@@ -540,11 +539,11 @@ class Simulation:
         lightest = float(wiped[1].max())
         light = np.append(sensor.dark_w_m2, scene.background.light_w_m2 * changed[1])
         darkest = float(light[0] + light[1:].min() * float(self._darkest_texture * wiped[1].min()))
-        shown: list[tuple[Source, tuple[Floats, Floats], Floats, Floats, Floats, Floats, _Look]] = []
+        shown: list[tuple[Source, tuple[Floats, Floats], Floats, Floats, Floats, Floats, _Footprint]] = []
         marked: list[NDArray[np.int64]] = []
         beyond: list[NDArray[np.uint8]] = []
         for i, source in enumerate(self._sources):
-            (places, depths), sent = stretch.seen[i], stretch.sent[i]
+            (places, depths), sent = stretch.projections[i], stretch.sent[i]
             place, depth = places[of_block], depths[of_block]
             if depth.min() <= NEAREST_M:
                 continue
@@ -555,28 +554,28 @@ class Simulation:
             bounds = ((place - place[:, :1]) * axis[:, None]).sum(-1)
             m = len(place) // 2
             depth_m = float(middle_depth[m])
-            look = self._looks.get(i)
-            if look is None or abs(depth_m / look.depth_m - 1) > _SAME_DEPTH:
-                # That of a depth that it is on its way to, so that it is as often too near as too far.
+            footprint = self._footprints.get(i)
+            if footprint is None or abs(depth_m / footprint.depth_m - 1) > _SAME_DEPTH:
+                # At the depth halfway through its time of use.
                 nearer = 1 + _SAME_DEPTH * float(np.sign(middle_depth[0] - middle_depth[-1]))
-                look = self._look(source, depth_m / nearer, float(strip_px[m]) * nearer, bounds[m] * nearer)
-                self._looks[i] = look
+                width_px = float(strip_px[m]) * nearer
+                footprint = self._make_footprint(source, depth_m / nearer, width_px, bounds[m] * nearer)
+                self._footprints[i] = footprint
             least = ACTIVITY_FLOOR * max(darkest, sensor.charge_us_w_m2 / source.longest_us)
-            lit, far = self._lit_pixels(place, 0.5 * float(strip_px.max()), look, least / lightest)
+            lit, far = self._find_lit_pixels(place, 0.5 * float(strip_px.max()), footprint, least / lightest)
             if len(lit):
                 marked.append(lit)
                 beyond.append(far)
-                shown.append((source, sent, place, strip_px, axis, bounds, look))
+                shown.append((source, sent, place, strip_px, axis, bounds, footprint))
         around = scene.background.around_px
         if not shown and around < camera.width:
             return None
-        pixels, masks, far = _merge(marked, beyond)
+        pixels, masks, far = _merge_pixels(marked, beyond)
         if around > 0:
-            pixels, masks, far = self._with_background(pixels, masks, far, [one[2] for one in shown])
+            pixels, masks, far = self._add_background(pixels, masks, far, [one[2] for one in shown])
 
-        g = len(shown)
+        g, poses = len(shown), len(starts)
         most = max((source.strip.clusters for source, *_ in shown), default=1)
-        poses = len(starts)
         origin, axis = np.empty((2, g, poses)), np.empty((2, g, poses))
         bounds, strips = np.zeros((g, most + 1, poses)), np.empty((g, poses))
         clusters, gain = np.empty(g, np.int64), np.empty(g)
@@ -585,20 +584,20 @@ class Simulation:
         switches: list[Floats] = []
         levels_of: list[Floats] = []
         halos_of: list[list[Floats]] = [[] for _ in self._halos]
-        for i, (source, sent, place, strip_px, along, cuts, look) in enumerate(shown):
+        for i, (source, sent, place, strip_px, along, cuts, footprint) in enumerate(shown):
             k = source.strip.clusters
             axis[:, i] = along.T
             origin[:, i] = place[:, 0].T
             bounds[i, : k + 1] = cuts.T
             strips[i], clusters[i], gain[i] = strip_px, k, source.light_w_m2
-            near_scale[i], near_reach[i] = look.scale_px, look.blur.reach_px
-            tables[i] = look.near
+            near_scale[i], near_reach[i] = footprint.scale_px, footprint.blur.reach_px
+            tables[i] = footprint.near
             when, levels = cut_changes(*sent, begin_us, end_us)
             switches.append(when)
             levels_of.append(levels)
-            for of, share in zip(halos_of, look.halos, strict=True):
+            for of, share in zip(halos_of, footprint.halos, strict=True):
                 of.append(levels @ share)
-        line, levels, halo = _time_line(starts, wiped, changed[0], switches, levels_of, halos_of, most)
+        line, levels, halo = _make_time_line(starts, wiped, changed[0], switches, levels_of, halos_of, most)
         world = (
             line,
             _kernels.Strips(levels, origin, axis, bounds, strips, clusters, gain),
@@ -606,29 +605,29 @@ class Simulation:
             _kernels.Near(self._near_share, tables, near_scale, near_reach),
             _kernels.Scenery(turn, self._texture_every, self._texture, light),
         )
-        batches = _batches(pixels, masks, far, self._texture_every)
-        at_px = unbent(scene.drops, *np.divmod(batches[0], camera.width), (begin_us + end_us) * 0.5e-6)
+        batches = _make_batches(pixels, masks, far, self._texture_every)
+        at_px = undo_drops(scene.drops, *np.divmod(batches[0], camera.width), (begin_us + end_us) * 0.5e-6)
         return _kernels.ActivePixels(number, end_us, *batches, at_px), world
 
-    def seen(self, source: Source, position: Floats, attitude: Floats) -> tuple[Floats, Floats]:
-        """Where a source's clusters start and end in the image, and their depths; see `project`."""
+    def project_source(self, source: Source, position: Floats, attitude: Floats) -> tuple[Floats, Floats]:
+        """Project the cuts between a source's clusters into the image, with their depths; see `project`."""
         image = source.image
         if image is None or image.kind != "window":
             return project(source.strip.cuts_m(), position, attitude, self.scene.camera)
-        # Light that comes from further to the right is light seen by a camera that looks further to the left.
+        # Light from further right is light for a camera turned further left.
         right, down = map(math.radians, image.turn_deg)
         turned = attitude + np.array([-right, down, 0.0])
         place, depth = project(source.strip.cuts_m(), position, turned, self.scene.camera)
         return place + np.array(image.shift_px), depth
 
-    def _with_background(
+    def _add_background(
         self,
         pixels: NDArray[np.int32],
         masks: NDArray[np.uint64],
         far: NDArray[np.uint8],
         places: list[Floats],
     ) -> tuple[NDArray[np.int32], NDArray[np.uint64], NDArray[np.uint8]]:
-        """Add the pixels around the sources on which only the background moves, in the order of pixels."""
+        """Add pixels around the sources, on which only the background moves, in the order of pixels."""
         width, height = self.scene.camera.width, self.scene.camera.height
         around = self.scene.background.around_px
         marked = np.full((height, width), around >= width)
@@ -644,27 +643,27 @@ class Simulation:
         found[known], near[known] = masks, far
         return every, found, near
 
-    def _lit_pixels(
-        self, place: Floats, half_px: float, look: _Look, least_w_m2: float
+    def _find_lit_pixels(
+        self, place: Floats, half_px: float, footprint: _Footprint, least_w_m2: float
     ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-        """Pixels, row by row, that a source lights by `least_w_m2` or more at any pose.
+        """Find pixels, row by row, that a source lights by `least_w_m2` or more at any pose.
 
         Returns:
-            The pixels, and how many of `_FAR_PX` they are from the strip, which is twice `half_px` wide.
+            The pixels, and how many of `_FAR_PX` they are beyond the strip, which is twice `half_px` wide.
         """
         nothing = np.empty(0, np.int64), np.empty(0, np.uint8)
-        if look.across[0] < least_w_m2:
+        if footprint.across[0] < least_w_m2:
             return nothing
         bend_px = sum(abs(drop.bend_px) for drop in self.scene.drops)
-        reach_across, reach_along = (reach + 0.5 + bend_px for reach in look.reach_px(least_w_m2))
+        reach_across, reach_along = (reach + 0.5 + bend_px for reach in footprint.reach_px(least_w_m2))
         middle = place[len(place) // 2]
         vector = middle[-1] - middle[0]
         length = float(np.hypot(*vector))
         axis = vector / length
-        # How far the strip wanders across itself and along itself, from its place in the middle pose.
-        away = place[:, [0, -1]] - middle[[0, -1]]
-        along = reach_along + float(np.abs(away @ axis).max())
-        across = reach_across + float(np.abs(away @ np.array([axis[1], -axis[0]])).max())
+        # How far the strip moves across and along itself from the middle pose.
+        offset = place[:, [0, -1]] - middle[[0, -1]]
+        along = reach_along + float(np.abs(offset @ axis).max())
+        across = reach_across + float(np.abs(offset @ np.array([axis[1], -axis[0]])).max())
         height, width = self.scene.camera.height, self.scene.camera.width
         reach = math.hypot(along, across)
         top = max(math.floor(min(middle[0, 1], middle[-1, 1]) - reach), 0)
@@ -673,35 +672,35 @@ class Simulation:
             return nothing
         rows = np.arange(top, low)
         dy = rows - middle[0, 1]
-        beside = _between(axis[1], dy * axis[0] - across, dy * axis[0] + across)
-        within = _between(axis[0], -along - dy * axis[1], length + along - dy * axis[1])
-        first = np.ceil(np.maximum(beside[0], within[0]) + middle[0, 0]).clip(0, width).astype(int)
-        last = np.floor(np.minimum(beside[1], within[1]) + middle[0, 0]).clip(-1, width - 1).astype(int)
+        sides = _line_between(axis[1], dy * axis[0] - across, dy * axis[0] + across)
+        ends = _line_between(axis[0], -along - dy * axis[1], length + along - dy * axis[1])
+        first = np.ceil(np.maximum(sides[0], ends[0]) + middle[0, 0]).clip(0, width).astype(int)
+        last = np.floor(np.minimum(sides[1], ends[1]) + middle[0, 0]).clip(-1, width - 1).astype(int)
         counts = np.maximum(last - first + 1, 0)
         begins = np.cumsum(counts) - counts
         x = np.repeat(first - begins, counts) + np.arange(counts.sum())
         y = np.repeat(rows, counts)
         dx, dy = x - middle[0, 0], y - middle[0, 1]
-        aside = np.abs(dx * axis[1] - dy * axis[0]) - half_px
-        ahead = np.abs(dx * axis[0] + dy * axis[1] - 0.5 * length) - 0.5 * length
-        away_px = np.maximum(aside, ahead) - bend_px
-        far = sum(((away_px >= px).view(np.uint8) for px in _FAR_PX), np.zeros(len(x), np.uint8))
+        across_px = np.abs(dx * axis[1] - dy * axis[0]) - half_px
+        along_px = np.abs(dx * axis[0] + dy * axis[1] - 0.5 * length) - 0.5 * length
+        distance_px = np.maximum(across_px, along_px) - bend_px
+        far = sum(((distance_px >= px).view(np.uint8) for px in _FAR_PX), np.zeros(len(x), np.uint8))
         return y * width + x, far
 
 
-def _since(words: NDArray[np.int64], later_us: float) -> NDArray[np.int64]:
-    """Requests as words since a block that began so much later."""
-    # What has waited for very long is no nearer than this, which a word still holds.
+def _shift_requests(words: NDArray[np.int64], later_us: float) -> NDArray[np.int64]:
+    """Shift the time origin of packed requests to a later time."""
+    # Requests that have waited for very long keep a time that fits into a word.
     ticks = np.maximum((words >> _kernels.CODE_BITS) - int(later_us * _kernels.TICKS), -(1 << 35))
-    since: NDArray[np.int64] = ticks << _kernels.CODE_BITS | words & ((1 << _kernels.CODE_BITS) - 1)
-    return since
+    shifted: NDArray[np.int64] = ticks << _kernels.CODE_BITS | words & ((1 << _kernels.CODE_BITS) - 1)
+    return shifted
 
 
-class _Served:
-    """What the readout makes of the pixels' requests, block by block of time.
+class _Readout:
+    """Reads out the pixels' requests, block by block of time.
 
     Args:
-        simulation: Whose scene, noise and counts they are.
+        simulation: The simulation, which has the scene, the noise and the counts.
     """
 
     def __init__(self, simulation: Simulation) -> None:
@@ -712,37 +711,39 @@ class _Served:
             early_us = max(0.0, early_us - _kernels.NOISE_LIMIT * sensor.jitter_us)
         self._early_us = early_us
         self._begin_us = 0.0
-        # What was too late for the last block, and what waited at its end, since that began.
+        # Requests too late for the last block, and those waiting at its end, since its start.
         self._later, self._queue = np.empty(0, np.int64), np.empty(0, np.int64)
         self._blind_us = np.zeros(camera.width * camera.height)
         self._memory = np.array([-1e18, -1.0, -1.0, 0.0])
         self._pending = np.zeros((camera.height, camera.width) if sensor.hold else (0, 0), bool)
         self._noise_from_us = 0.0
 
-    def of(self, number: int, end_us: float, signal: list[_Requests]) -> Events:
-        """Events that are certain when the block that ends then has given these requests."""
+    def read_block(self, number: int, end_us: float, signal: list[_Requests]) -> Events:
+        """Return the events that are certain after the requests of the block that ends at this time."""
         simulation = self._simulation
         sensor, camera = simulation.scene.sensor, simulation.scene.camera
         scene_end_us = simulation.scene.duration_s * 1e6
-        over = end_us == scene_end_us
-        safe = math.inf if over else end_us + self._early_us
-        noise_to = min(end_us if over else safe, scene_end_us)
-        noise = simulation.noise(number, self._noise_from_us, noise_to)
-        self._noise_from_us = end_us if over else safe
+        is_last = end_us == scene_end_us
+        safe = math.inf if is_last else end_us + self._early_us
+        noise_to = min(end_us if is_last else safe, scene_end_us)
+        noise = simulation.draw_noise(number, self._noise_from_us, noise_to)
+        self._noise_from_us = end_us if is_last else safe
         simulation.counts["signal_events"] += sum(len(t) for t, _ in signal)
         begin = number * _BLOCK_US
-        later, queue = (_since(words, begin - self._begin_us) for words in (self._later, self._queue))
+        later, queue = (
+            _shift_requests(words, begin - self._begin_us) for words in (self._later, self._queue)
+        )
         self._begin_us = begin
-        parts = [request_words(when, code, begin) for when, code in (*signal, noise)]
-        # What waits from before comes first.
+        parts = [pack_requests(when, code, begin) for when, code in (*signal, noise)]
+        # Waiting requests come first.
         words, waiting = np.concatenate([queue, later, *parts]), len(queue)
         new = words[waiting:]
         new.sort()
         cut = len(new)
-        if not over:
+        if not is_last:
             cut = int(np.searchsorted(new, int((safe - begin) * _kernels.TICKS) << _kernels.CODE_BITS))
         self._later = new[cut:].copy()
-        kept = _kernels.drop_blind(new[:cut], begin, self._blind_us, camera.width, sensor.refr_us)
+        kept = _kernels.drop_blind_requests(new[:cut], begin, self._blind_us, camera.width, sensor.refr_us)
         words = words[: waiting + kept]
         n = len(words)
         columns = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)

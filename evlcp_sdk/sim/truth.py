@@ -1,4 +1,4 @@
-"""The truth beside a recording: what each bar sent, with which link, and where it was in the image."""
+"""The truth of a recording: what each bar sent, with which link, and where it was in the image."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -20,10 +20,10 @@ from evlcp_sdk.specs import SpecError, validate_table
 Floats = NDArray[np.float64]
 
 _DARK_W_M2 = 1e-6
-"""Light up to which a bar counts as dark."""
+"""Most light of a dark bar."""
 
-_MOST = 1e18
-"""Size of the largest number that a truth holds: microseconds since 1970 are 1e15."""
+_MOST_VALUE = 1e18
+"""Largest number in a truth: microseconds since 1970 are 1e15."""
 
 _MOST_PPM = 1e5
 
@@ -34,17 +34,17 @@ class SentBar:
 
     Attributes:
         link: The link that it was sent with.
-        symbols: int64 (packets, frames, clusters); packet 0 is on air as the scene starts. None of them,
-            (0, frames, clusters), where the bar sends chips of a file.
+        symbols: Symbols, int64 (packets, frames, clusters); packet 0 is on air as the scene starts. A bar
+            that sends chips of a file has no packets.
         start_chip: Chip of packet 0 that is on air as the scene starts.
         ppm: How much faster than nominal its clock runs.
         payload: "symbols", "data" or "messages".
-        sends_frames: It is lit, and sends packets.
-        lit: It is lit.
+        sends_frames: Whether it is lit and sends packets.
+        lit: Whether it is lit.
         centre_px: Column and row of its centre at `Truth.t_us`, float64 (n, 2).
         distance_m: Depth of its centre along the optical axis, m, float64 (n,).
-        covered: Clusters that are hidden all the time.
-        cover_s: Times and clusters that are hidden then: (from s, to s, first cluster, last cluster).
+        covered: Clusters that are always hidden.
+        cover_s: Clusters hidden for a time: (from s, to s, first cluster, last cluster).
         pole_s: Times when all of it is hidden: (from s, to s).
     """
 
@@ -84,19 +84,19 @@ class SentBar:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a recording shows.
+    """The truth of a recording.
 
     Attributes:
         t0_us: Camera clock as the scene starts, us.
         duration_us: Length of the scene, us.
         t_us: Times of the samples, from the scene's start, us, float64 (n,).
         bars: What each bar sent, and where it was.
-        sites: Where the bars stand on earth; none without a `[world]`.
+        sites: Sites of the bars on earth; none without a `[world]`.
         camera_path: Arrays of the camera at `t_us`: latitude_deg, longitude_deg, height_m, heading_deg,
             pitch_deg, roll_deg, float64 (n,), in a scene on earth; position_m and attitude_deg, float64
-            (3, n), in the scene's own axes. Empty where the file says none.
+            (3, n), in the scene's axes. Empty if the file has none.
         table: The rest of the JSON: scene, camera, simulator, counts, and under `bars` the rest of each bar.
-        warnings: What does not fit this installation, in words.
+        warnings: Differences from this installation, in words.
     """
 
     t0_us: int
@@ -109,17 +109,17 @@ class Truth:
     warnings: tuple[str, ...] = ()
 
     def to_table(self) -> dict[str, Any]:
-        """What `REC.truth.json` holds, as JSON values; `truth_from_table` takes it back.
+        """Convert to the JSON values of `REC.truth.json`, for `truth_from_table`.
 
         A bar's `profile`, `clusters`, `frames`, `pilot_every` and `packet_chips` are there for other readers;
-        what counts is its `link`, the digest of one of the `links`.
+        its `link` is the digest of one of the `links`.
         """
         links = {bar.link.digest: bar.link for bar in self.bars}
         found = dict(self.table)
         found["scene"] = {**found.get("scene", {}), "t0_us": self.t0_us}
         found["scene"].setdefault("duration_s", self.duration_us / 1e6)
         rest = found.get("bars", ({},) * len(self.bars))
-        found["bars"] = [{**_table_of(bar), **more} for bar, more in zip(self.bars, rest, strict=True)]
+        found["bars"] = [{**_to_bar_table(bar), **more} for bar, more in zip(self.bars, rest, strict=True)]
         found["links"] = {
             digest: {
                 "table": {section: dict(keys) for section, keys in link.table.items()},
@@ -139,22 +139,22 @@ class Truth:
 
 
 def truth_path(url: Path | str) -> Path:
-    """Where the truth of a recording lies: `night.raw` and `night.csv.gz` have `night.truth.json`."""
+    """Return the path of a recording's truth: `night.raw` and `night.csv.gz` have `night.truth.json`."""
     path = Path(url)
     stem = path.name.removesuffix(".gz").rsplit(".", 1)[0] or path.name
     return path.with_name(f"{stem}.truth.json")
 
 
 def read_truth(path: Path | str, registry: Registry | None = None) -> Truth:
-    """The truth of a recording, from its `REC.truth.json`.
+    """Read the truth of a recording from its `REC.truth.json`.
 
     Args:
         path: The file.
-        registry: Where the algorithms of its links are found; None for all that are installed.
+        registry: The algorithms of its links; None for all that are installed.
 
     Raises:
-        InputError: It cannot be read, is not a scene's truth, or names codes that are not those of this
-            installation; one line.
+        InputError: It cannot be read, is not a scene's truth, or has other codes than this installation; one
+            line.
     """
     return truth_from_table(read_json(path), registry, source=str(path))
 
@@ -166,19 +166,19 @@ def truth_from_table(
     source: str = "truth",
     links: Mapping[str, Link] | None = None,
 ) -> Truth:
-    """The truth of what `REC.truth.json` holds.
+    """Parse the JSON values of `REC.truth.json`.
 
-    A file of another generator that names no link is read as sent with the default link, but for the
-    `profile`, `clusters`, `frames` and `pilot_every` of its bars.
+    Bars of another generator without a link are taken to use the default link, but for their `profile`,
+    `clusters`, `frames` and `pilot_every`.
 
     Args:
         table: The JSON values.
-        registry: Where the algorithms of its links are found; None for all that are installed.
-        source: What faults name as their place.
+        registry: The algorithms of its links; None for all that are installed.
+        source: Name of the truth in error messages.
         links: Links by digest, instead of those of the table.
 
     Raises:
-        InputError: It is not a scene's truth, or names codes that are not those of this installation.
+        InputError: It is not a scene's truth, or has other codes than this installation.
     """
     try:
         found = validate_table(_TruthTable, table)
@@ -186,60 +186,63 @@ def truth_from_table(
         raise InputError(f"{source}: not a scene's truth: {refused.lines()[0].strip()}") from refused
     t_us, n = np.array(found.t_s) * 1e6, len(found.t_s)
     if not n or (np.diff(t_us) <= 0).any():
-        raise _fault(source, "t_s", found.t_s, "rising times, one at the least")
+        raise _make_error(source, "t_s", found.t_s, "rising times, one at the least")
     for key, lists in (("distance_m", found.distance_m), ("bar_centre_px", found.bar_centre_px)):
         if len(lists) < len(found.bars):
-            raise _fault(source, key, lists, f"one list a bar, {len(found.bars)}")
+            raise _make_error(source, key, lists, f"one list a bar, {len(found.bars)}")
     warnings: list[str] = []
     if links is None:
-        links = _links_of(found, registry, source, warnings)
+        links = _resolve_links(found, registry, source, warnings)
     bars = []
     for i, row in enumerate(found.bars):
         where, (columns, rows), depths = f"bars.{i}", found.bar_centre_px[i], found.distance_m[i]
         for key, values in (("bar_centre_px", columns), ("bar_centre_px", rows), ("distance_m", depths)):
             if len(values) != n:
-                raise _fault(source, f"{key}.{i}", values, f"{n} numbers, one a time of t_s")
+                raise _make_error(source, f"{key}.{i}", values, f"{n} numbers, one a time of t_s")
         if row.link is None and not links:
-            link = _resolved(_link_table_of(row, where, source), registry, where, source)
+            link = _resolve_link(_make_link_table(row, where, source), registry, where, source)
         elif (row.link or "") in links:
             link = links[row.link or ""]
         else:
-            raise _fault(source, f"{where}.link", row.link, "the digest of one of the links")
-        bars.append(_sent_bar(row, where, source, link, np.array([columns, rows]).T, np.array(depths)))
+            raise _make_error(source, f"{where}.link", row.link, "the digest of one of the links")
+        bars.append(_parse_bar(row, where, source, link, np.array([columns, rows]).T, np.array(depths)))
     try:
         path = {key: np.array(values) for key, values in found.camera_path.items()}
     except ValueError as fault:
-        raise _fault(source, "camera_path", found.camera_path, "lists of one length") from fault
+        raise _make_error(source, "camera_path", found.camera_path, "lists of one length") from fault
     return Truth(
         t0_us=int(found.scene.t0_us),
         duration_us=found.scene.duration_s * 1e6,
         t_us=t_us,
         bars=tuple(bars),
-        sites=_sites_of(found, source),
+        sites=_parse_sites(found, source),
         camera_path=path,
-        table=_rest_of(table),
+        table=_keep_other_keys(table),
         warnings=tuple(warnings),
     )
 
 
-_READ = ("bars", "t_s", "distance_m", "bar_centre_px", "links", "sites", "camera_path")
-"""Keys of the table that a `Truth` holds itself."""
+_TRUTH_KEYS = ("bars", "t_s", "distance_m", "bar_centre_px", "links", "sites", "camera_path")
+"""Keys of the table that are attributes of a `Truth`."""
 
-_OWN = ("link", "symbols", "start_chip", "ppm", "payload", "covered", "cover_s", "pole_s")
-"""Keys of a bar's table that `SentBar` holds, and those that follow from its link."""
+_BAR_KEYS = ("link", "symbols", "start_chip", "ppm", "payload", "covered", "cover_s", "pole_s")
+"""Keys of a bar's table that are attributes of a `SentBar`; below, those that follow from its link."""
 
-_OF_LINK = ("profile", "clusters", "frames", "pilot_every", "packet_chips")
+_LINK_KEYS = ("profile", "clusters", "frames", "pilot_every", "packet_chips")
 
 
-def _rest_of(table: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a truth's table nothing else of a `Truth` holds; of chips of a file, what a link says else."""
-    rest = {key: value for key, value in table.items() if key not in _READ}
-    bars = [(row, _OWN if row.get("chips_file") is not None else _OWN + _OF_LINK) for row in table["bars"]]
+def _keep_other_keys(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the rest of a truth's table; bars with chips of a file keep what else is in their link."""
+    rest = {key: value for key, value in table.items() if key not in _TRUTH_KEYS}
+    bars = [
+        (row, _BAR_KEYS if row.get("chips_file") is not None else _BAR_KEYS + _LINK_KEYS)
+        for row in table["bars"]
+    ]
     rest["bars"] = tuple({key: row[key] for key in row if key not in held} for row, held in bars)
     return rest
 
 
-def _table_of(bar: SentBar) -> dict[str, Any]:
+def _to_bar_table(bar: SentBar) -> dict[str, Any]:
     form = bar.link.packet
     return {
         "link": bar.link.digest,
@@ -260,7 +263,7 @@ def _table_of(bar: SentBar) -> dict[str, Any]:
     }
 
 
-_Number = Annotated[float, Field(ge=-_MOST, le=_MOST)]
+_Number = Annotated[float, Field(ge=-_MOST_VALUE, le=_MOST_VALUE)]
 _Count = Annotated[int, Field(ge=1, le=2**32)]
 _Cluster = Annotated[int, Field(ge=0, le=2**32)]
 
@@ -271,14 +274,14 @@ class _Table(BaseModel):
 
 class _SceneTable(_Table):
     t0_us: _Number
-    duration_s: Annotated[float, Field(ge=0, le=_MOST)]
+    duration_s: Annotated[float, Field(ge=0, le=_MOST_VALUE)]
 
 
 class _BarTable(_Table):
-    """A bar, which says its link; or, in a file of another generator, its profile, clusters and frames."""
+    """A bar with its link; or, in a file of another generator, with its profile, clusters and frames."""
 
     symbols: list[list[list[_Cluster]]]
-    start_chip: Annotated[float, Field(ge=0, le=_MOST)]
+    start_chip: Annotated[float, Field(ge=0, le=_MOST_VALUE)]
     ppm: Annotated[float, Field(ge=-_MOST_PPM, le=_MOST_PPM)]
     payload: Literal["symbols", "data", "messages"] | None = None
     led_w_m2: _Number | None = None
@@ -311,26 +314,26 @@ class _TruthTable(_Table):
     camera_path: dict[str, list[_Number] | list[list[_Number]]] = {}
 
 
-def _fault(source: str, where: str, value: Any, wanted: str) -> InputError:
+def _make_error(source: str, where: str, value: Any, wanted: str) -> InputError:
     return InputError(f"{source}: not a scene's truth: {where} = {value!r:.40}: expected {wanted}")
 
 
-def _sent_bar(
+def _parse_bar(
     row: _BarTable, where: str, source: str, link: Link, centre_px: Floats, distance_m: Floats
 ) -> SentBar:
     covered, cover_s = row.covered or [], row.cover_s or []
     clusters, frames, top = link.codebook.clusters, link.packet.frames, len(link.codebook.codewords) - 1
     for key, numbers in (("covered", covered), ("cover_s", [k for *_, a, b in cover_s for k in (a, b)])):
         if max(numbers, default=0) >= clusters:
-            raise _fault(source, f"{where}.{key}", getattr(row, key), f"clusters 0 to {clusters - 1}")
+            raise _make_error(source, f"{where}.{key}", getattr(row, key), f"clusters 0 to {clusters - 1}")
     wanted = f"packets of {frames} frames of {clusters} symbols, 0 to {top}"
     if {len(packet) for packet in row.symbols} - {frames} or {
         len(frame) for packet in row.symbols for frame in packet
     } - {clusters}:
-        raise _fault(source, f"{where}.symbols", row.symbols, wanted)
+        raise _make_error(source, f"{where}.symbols", row.symbols, wanted)
     symbols = np.array(row.symbols, np.int64).reshape(-1, frames, clusters)
     for q, f, k in np.argwhere(symbols > top)[:1].tolist():
-        raise _fault(source, f"{where}.symbols.{q}.{f}.{k}", int(symbols[q, f, k]), f"0 to {top}")
+        raise _make_error(source, f"{where}.symbols.{q}.{f}.{k}", int(symbols[q, f, k]), f"0 to {top}")
     lit = row.led_w_m2 is None or row.led_w_m2 > _DARK_W_M2
     return SentBar(
         link=link,
@@ -348,20 +351,20 @@ def _sent_bar(
     )
 
 
-def _links_of(
+def _resolve_links(
     truth: _TruthTable, registry: Registry | None, source: str, warnings: list[str]
 ) -> dict[str, Link]:
-    """The links of a truth by digest; what fits this installation but for the digest is a warning."""
+    """Return the links of a truth by digest; another digest of the same codes here is a warning."""
     found = {}
     for digest, entry in (truth.links or {}).items():
         where = f"links.{digest[:12]}"
-        link = _resolved(entry.table, registry, where, source)
-        other = [
+        link = _resolve_link(entry.table, registry, where, source)
+        differences = [
             f"{role} {link.table[role]['id']} {entry.revisions.get(role)} there, {here} here"
             for role, here in link.revisions.items()
             if entry.revisions.get(role) != here
         ]
-        revisions = f" (revisions: {'; '.join(other)})" if other else ""
+        revisions = f" (revisions: {'; '.join(differences)})" if differences else ""
         if link.codebook.digest != entry.codebook:
             raise InputError(
                 f"{source}: {where}.codebook = {entry.codebook[:12]}: its settings give"
@@ -375,7 +378,7 @@ def _links_of(
     return found
 
 
-def _resolved(table: Mapping[str, Any], registry: Registry | None, where: str, source: str) -> Link:
+def _resolve_link(table: Mapping[str, Any], registry: Registry | None, where: str, source: str) -> Link:
     try:
         return resolve(table, registry)
     except EvlcpError as refused:
@@ -383,7 +386,7 @@ def _resolved(table: Mapping[str, Any], registry: Registry | None, where: str, s
         raise InputError(f"{source}: {where}: not a link here: {first}") from refused
 
 
-def _sites_of(truth: _TruthTable, source: str) -> tuple[BarSite, ...]:
+def _parse_sites(truth: _TruthTable, source: str) -> tuple[BarSite, ...]:
     if not truth.sites:
         return ()
     try:
@@ -395,8 +398,8 @@ def _sites_of(truth: _TruthTable, source: str) -> tuple[BarSite, ...]:
 _LEDS_PER_CLUSTER = 6
 
 
-def _link_table_of(row: _BarTable, where: str, source: str) -> dict[str, Any]:
-    """The link's table of a bar that says its profile, clusters and frames instead of a link."""
+def _make_link_table(row: _BarTable, where: str, source: str) -> dict[str, Any]:
+    """Return the table of the link of a bar that states its profile, clusters and frames instead."""
     for key, value in (("profile", row.profile), ("frames", row.frames)):
         if value is None:
             raise InputError(f"{source}: {where}.{key}: missing; expected it, or a link")

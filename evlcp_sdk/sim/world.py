@@ -1,6 +1,6 @@
-"""Where a scene is on earth: its bars as sites, its camera's path as geodetic positions and attitudes.
+"""Place a scene on earth: its bars as sites, its camera's path as geodetic positions and attitudes.
 
-A scene's axes are x to the right, y down and z ahead, with its origin at `[world]`, z level and towards
+The axes of a scene are x to the right, y down and z ahead, with its origin at `[world]`, z level and towards
 `world.heading_deg`.
 """
 
@@ -24,25 +24,25 @@ Floats = NDArray[np.float64]
 
 
 def bar_axis(bar: BarSpec) -> tuple[float, float, float]:
-    """Unit vector from a bar's top to its bottom in the scene's axes."""
+    """Return the unit vector from a bar's top to its bottom in the scene's axes."""
     lean, tilt = math.radians(bar.lean_deg), math.radians(bar.tilt_deg)
     return -math.sin(lean) * math.cos(tilt), math.cos(lean) * math.cos(tilt), -math.sin(tilt)
 
 
-def bar_across(bar: BarSpec) -> tuple[float, float, float]:
-    """Unit vector from the left of a bar to its right in the scene's axes."""
+def bar_right(bar: BarSpec) -> tuple[float, float, float]:
+    """Return the unit vector from the left of a bar to its right in the scene's axes."""
     lean = math.radians(bar.lean_deg)
     return math.cos(lean), math.sin(lean), 0.0
 
 
-def bar_towards(bar: BarSpec) -> tuple[float, float, float]:
-    """Unit vector from a bar to who looks at its front in the scene's axes."""
-    x, y, z = np.cross(bar_axis(bar), bar_across(bar)).tolist()
+def bar_normal(bar: BarSpec) -> tuple[float, float, float]:
+    """Return the unit vector out of a bar's front in the scene's axes."""
+    x, y, z = np.cross(bar_axis(bar), bar_right(bar)).tolist()
     return x, y, z
 
 
 def scene_to_enu(vectors: Floats, heading_deg: float) -> Floats:
-    """Vectors in the scene's axes, float64 (..., 3), as east, north, up.
+    """Convert vectors in the scene's axes to east, north, up, float64 (..., 3).
 
     >>> scene_to_enu(np.array([0.0, -1.0, 10.0]), 90.0).round(6).tolist()
     [10.0, 0.0, 1.0]
@@ -55,27 +55,27 @@ def scene_to_enu(vectors: Floats, heading_deg: float) -> Floats:
 
 
 def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, ...]:
-    """The bars of a scene as sites; the first bar is transmitter 1 unless it has an id.
+    """Return the bars of a scene as sites; the first bar is transmitter 1 unless it has an id.
 
     Args:
-        scene: With its `[world]`.
-        registry: Where the algorithms of its links are found; None for all that are installed.
+        scene: A scene with a `[world]`.
+        registry: The algorithms of its links; None for all that are installed.
 
     Raises:
-        ConfigError: The scene has no `[world]`, or a bar's link is none.
+        ConfigError: The scene has no `[world]`, or a bar's link is not valid.
     """
-    world, axes = _world(scene)
+    world, axes = _require_world(scene)
     sites = []
     for i, (bar, link) in enumerate(zip(scene.bars, links_of(scene, registry), strict=True)):
         latitude, longitude, height = axes.to_geodetic(
             scene_to_enu(np.array([bar.x_m, bar.y_m, bar.z_m]), world.heading_deg)
         )
-        east, north, _ = scene_to_enu(np.array(bar_towards(bar)), world.heading_deg)
+        east, north, _ = scene_to_enu(np.array(bar_normal(bar)), world.heading_deg)
         facing = math.degrees(math.atan2(east, north)) % 360
         east, north, up = -scene_to_enu(np.array(bar_axis(bar)), world.heading_deg)
-        lean = math.hypot(east, north)
-        # A bar that stands upright leans nowhere.
-        heading = math.degrees(math.atan2(east, north)) % 360 if lean > 1e-9 else 0.0
+        level = math.hypot(east, north)
+        # A vertical bar has no heading.
+        heading = math.degrees(math.atan2(east, north)) % 360 if level > 1e-9 else 0.0
         sites.append(
             BarSite(
                 transmitter_id=i + 1 if bar.transmitter_id is None else bar.transmitter_id,
@@ -83,7 +83,7 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
                 longitude_deg=float(longitude),
                 height_m=float(height),
                 heading_deg=heading,
-                tilt_deg=math.degrees(math.atan2(lean, up)),
+                tilt_deg=math.degrees(math.atan2(level, up)),
                 length_m=link.bar.length_m,
                 position_sigma_m=0.0,
                 facing_deg=None if link.bar.is_even_line else facing,
@@ -92,21 +92,22 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
     return tuple(sites)
 
 
-def surveyed_sites(scene: Scene, seed: int, registry: Registry | None = None) -> tuple[BarSite, ...]:
-    """The same as a survey says them: with its errors, and with what is wrong without anybody's knowledge.
+def survey_sites(scene: Scene, seed: int, registry: Registry | None = None) -> tuple[BarSite, ...]:
+    """Return the sites of the bars as a survey reports them: with its errors, and with faults it is not aware
+    of.
 
     Args:
-        scene: With its `[world]`.
-        seed: Of the errors.
+        scene: A scene with a `[world]`.
+        seed: Seed of the errors.
         registry: As in `sites_of`.
 
     Raises:
-        ConfigError: The scene has no `[world]`, a bar's link is none, or its `site_of` is no bar.
+        ConfigError: The scene has no `[world]`, a bar's link is not valid, or its `site_of` is no bar.
     """
-    world, axes = _world(scene)
+    world, axes = _require_world(scene)
     true = sites_of(scene, registry)
-    errors = _drawn(scene, seed, 0x517E).normal(size=(len(true), 3)) * world.survey_sigma_m
-    said = []
+    errors = _make_rng(scene, seed, 0x517E).normal(size=(len(true), 3)) * world.survey_sigma_m
+    surveyed = []
     for i, (bar, site) in enumerate(zip(scene.bars, true, strict=True)):
         if bar.site_of is not None and bar.site_of >= len(true):
             bars = format_count(len(true), "bar")
@@ -118,14 +119,14 @@ def surveyed_sites(scene: Scene, seed: int, registry: Registry | None = None) ->
             enu = axes.to_enu(there.latitude_deg, there.longitude_deg, there.height_m) + off
             keys = ("latitude_deg", "longitude_deg", "height_m")
             place = dict(zip(keys, map(float, axes.to_geodetic(enu)), strict=True))
-        said.append(
+        surveyed.append(
             replace(there, transmitter_id=site.transmitter_id, position_sigma_m=world.survey_sigma_m, **place)
         )
-    return tuple(said)
+    return tuple(surveyed)
 
 
-def rendered(scene: Scene) -> Scene:
-    """The scene without what is only said of it: scenes for which this is the same look the same."""
+def drop_reported_errors(scene: Scene) -> Scene:
+    """Return the scene without errors of reported sites and attitudes, which do not change its rendering."""
     bars = tuple(replace(bar, site_off_m=(0.0, 0.0, 0.0), site_of=None) for bar in scene.bars)
     world = scene.world
     if world is not None:
@@ -133,21 +134,21 @@ def rendered(scene: Scene) -> Scene:
     return replace(scene, bars=bars, world=world)
 
 
-def camera_on_earth(scene: Scene, position_m: Floats, attitude_rad: Floats) -> dict[str, Any]:
-    """Where the camera is and looks, as lists, one entry a time.
+def locate_camera(scene: Scene, position_m: Floats, attitude_rad: Floats) -> dict[str, Any]:
+    """Return geodetic positions and attitudes of the camera as lists, one entry a time.
 
-    Keys latitude_deg, longitude_deg, height_m; heading_deg clockwise from north, pitch_deg up, roll_deg with
-    the camera's top to the right.
+    The keys are latitude_deg, longitude_deg, height_m; heading_deg clockwise from north, pitch_deg up,
+    roll_deg with the camera's top to the right.
 
     Args:
-        scene: With its `[world]`.
-        position_m: In the scene's axes, float64 (n, 3).
+        scene: A scene with a `[world]`.
+        position_m: Positions in the scene's axes, float64 (n, 3).
         attitude_rad: Yaw, pitch, roll in the scene, float64 (n, 3).
 
     Raises:
         ConfigError: The scene has no `[world]`.
     """
-    world, axes = _world(scene)
+    world, axes = _require_world(scene)
     latitude, longitude, height = axes.to_geodetic(scene_to_enu(position_m, world.heading_deg))
     yaw, pitch, roll = np.degrees(attitude_rad).T
     # 1e-9 degrees are 0.1 mm.
@@ -162,26 +163,25 @@ def camera_on_earth(scene: Scene, position_m: Floats, attitude_rad: Floats) -> d
 
 
 def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeLog | None:
-    """What an IMU says of the camera's attitude, every millisecond: the truth and one error a recording, and
-    what is wrong without anybody's knowledge.
+    """Return an IMU's log of the camera's attitude, every millisecond, with its errors and unknown faults.
 
     Args:
-        scene: With its `[world]`.
-        seed: Of the errors.
+        scene: A scene with a `[world]`.
+        seed: Seed of the errors, which are constant over a recording.
         path: The camera's path.
 
     Returns:
-        The log; None where `world.attitude` is "none".
+        The log; None if `world.attitude` is "none".
 
     Raises:
         ConfigError: The scene has no `[world]`.
     """
-    world, _ = _world(scene)
+    world, _ = _require_world(scene)
     if world.attitude == "none":
         return None
     t_us = np.append(np.arange(0.0, scene.duration_s * 1e6, 1000.0), scene.duration_s * 1e6)
-    yaw, pitch, roll = np.degrees(path.at(np.maximum(t_us - world.attitude_late_ms * 1e3, 0.0))[1]).T
-    error = _drawn(scene, seed, 0xA77).normal(size=3) * world.attitude_errs
+    yaw, pitch, roll = np.degrees(path.sample(np.maximum(t_us - world.attitude_late_ms * 1e3, 0.0))[1]).T
+    error = _make_rng(scene, seed, 0xA77).normal(size=3) * world.attitude_errs
     off = np.array(world.attitude_off_deg)
     heading = world.heading_deg + yaw + error[2] * world.heading_sigma_deg + off[2]
     return AttitudeLog(
@@ -194,18 +194,18 @@ def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeLog | Non
     )
 
 
-def _drawn(scene: Scene, seed: int, of: int) -> np.random.Generator:
-    """Random numbers of a recording's own: other ones where the camera or a bar stands or moves otherwise.
+def _make_rng(scene: Scene, seed: int, purpose: int) -> np.random.Generator:
+    """Make the generator of a recording, seeded by where its camera and bars are.
 
-    What is merely said of the scene does not count, so that a fault is compared with the same drive without.
+    Reported errors do not change the seed, so that a fault is compared with the same drive without it.
     """
     motion = replace(scene.motion, path_file=None)
     bars = [(bar.x_m, bar.y_m, bar.z_m, bar.lean_deg, bar.tilt_deg) for bar in scene.bars]
     digest = hashlib.sha256(repr((motion, bars)).encode()).digest()
-    return np.random.default_rng([seed, of, int.from_bytes(digest[:8])])
+    return np.random.default_rng([seed, purpose, int.from_bytes(digest[:8])])
 
 
-def _world(scene: Scene) -> tuple[WorldSpec, LocalAxes]:
+def _require_world(scene: Scene) -> tuple[WorldSpec, LocalAxes]:
     world = scene.world
     if world is None:
         raise ConfigError("the scene has no [world]: nothing says where on earth it is")

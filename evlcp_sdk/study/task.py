@@ -13,7 +13,7 @@ from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, load_scene, truth_of
-from evlcp_sdk.sim.world import attitude_log, rendered, surveyed_sites
+from evlcp_sdk.sim.world import attitude_log, drop_reported_errors, survey_sites
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.measure import message_tallies, position_tallies, statistics_of
@@ -44,7 +44,9 @@ def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
             raise ConfigError("base: missing; expected a preset or a scene file")
         scene = load_scene(base, settings, registry)
         # What is only reported of a scene is not seen.
-        return Case(value=scene, identity=_identity(scene), group=digest_of(_identity(rendered(scene))))
+        return Case(
+            value=scene, identity=_identity(scene), group=digest_of(_identity(drop_reported_errors(scene)))
+        )
 
     def link_of(base: str | None, settings: Sequence[str]) -> Case:
         link = load_link(base, settings, registry)
@@ -142,7 +144,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
     for task, link, attitude, packets in parts:
         others = message_tallies(packets, truth, link.block_coder()) if messages else []
         if scene.world is not None:
-            sites = surveyed_sites(_sending(task.scene, task.link[0]), job.seed, registry)
+            sites = survey_sites(_sending(task.scene, task.link[0]), job.seed, registry)
             others += position_tallies(packets, truth, link, attitude, sites)
         counted = statistics_of(frames_of(packets), truth, events=number, packets=len(packets), others=others)
         results.append((task.id, counted))

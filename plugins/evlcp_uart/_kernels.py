@@ -1,4 +1,4 @@
-"""Kernels: evidence of a bit and of a character at every tick, and the best path through them."""
+"""Kernels: the evidence of bits and characters at every tick, and the best path of characters."""
 
 import math
 from typing import Any
@@ -11,37 +11,37 @@ from evlcp_sdk.kernels import njit
 Column = NDArray[Any]
 
 _NOTHING = 30.0
-"""Nats by which what is less likely is left out: 1e-13 of it, against an outlier of a thousandth."""
+"""Nats below the likeliest context at which others are neglected: 1e-13, with outliers of a thousandth."""
 
 _AT_ONCE = 64
-"""Ticks of which words are followed side by side, as a processor adds several numbers at once."""
+"""Ticks whose words are scored together, in vector instructions."""
 
 
 @njit
-def bit_evidence(
+def compute_bit_evidence(
     counts: Column, logs: Column, gains: Column, means: Column, share: float, outlier: float, out: Column
 ) -> None:
-    """Log-likelihood of the window behind every tick for each context of a bit, less that of the last one.
+    """Compute the log-likelihood of the window after every tick for each context, minus that of the last one.
 
     Args:
         counts: Events of each tick, OFF and ON, int32 (2, n).
-        logs: Logarithm of the mean events of each tick of a window, by polarity, tick and context, each
-            counted as `share`, float64 (2, W, C).
-        gains: Logarithms of the gains that a window may have, float64 (J,).
-        means: What a window costs by context and gain: its mean events, each counted as `share`, less the
-            logarithm of the gain's share, float64 (C, J).
-        share: What an event counts.
+        logs: Logarithm of the mean events of each tick of a window, weighted by `share`, by polarity, tick
+            and context, float64 (2, W, C).
+        gains: Logarithms of the gains of a window, float64 (J,).
+        means: Cost of a window by context and gain: its mean events, weighted by `share`, minus the logarithm
+            of the gain's share, float64 (C, J).
+        share: Weight of an event.
         outlier: Probability that a window is of no context.
-        out: Of each tick that has W of them before the end, float64 (n - W + 1, C).
+        out: The log-likelihoods, float64 (n - W + 1, C).
     """
     _, width, contexts = logs.shape
-    # What the gains make of a context depends on how many events there are, not on when they come.
+    # The effect of gains depends on the number of events, not on their times.
     many = np.zeros(len(out), np.int64)
     for m in range(width):
         many += counts[0, m : m + len(out)] + counts[1, m : m + len(out)]
     of_gains = np.empty((many.max() + 1 if len(out) else 0, contexts))
     is_known = np.zeros(len(of_gains), np.bool_)
-    worth = np.empty(contexts)
+    score = np.empty(contexts)
     least = math.log(outlier)
     for s in range(len(out)):
         events = many[s]
@@ -49,7 +49,7 @@ def bit_evidence(
             out[s] = out[s - 1]
             continue
         for c in range(0 if is_known[events] else contexts):
-            # The logarithm of the sum over gains of what they make of so many events.
+            # The logarithm of the sum over gains for this number of events.
             most, total = -np.inf, 0.0
             for j in range(len(gains)):
                 most = max(most, share * events * gains[j] - means[c, j])
@@ -58,62 +58,61 @@ def bit_evidence(
             of_gains[events, c] = most + math.log(total)
         is_known[events] = True
         for c in range(contexts):
-            worth[c] = of_gains[events, c]
+            score[c] = of_gains[events, c]
         for polarity in range(2):
             for m in range(width):
                 k = counts[polarity, s + m]
                 if k:
                     for c in range(contexts):
-                        worth[c] += k * logs[polarity, m, c]
-        top = worth[0]
+                        score[c] += k * logs[polarity, m, c]
+        top = score[0]
         for c in range(contexts):
-            top = max(top, worth[c])
+            top = max(top, score[c])
         for c in range(contexts):
-            # What is less is nothing beside an outlier.
-            near = worth[c] > top - _NOTHING
-            out[s, c] = math.log((1 - outlier) * math.exp(worth[c] - top) + outlier) if near else least
+            # Lower ones are negligible against an outlier.
+            near = score[c] > top - _NOTHING
+            out[s, c] = math.log((1 - outlier) * math.exp(score[c] - top) + outlier) if near else least
         last = out[s, contexts - 1]
         for c in range(contexts):
             out[s, c] -= last
 
 
 @njit
-def character_scores(
+def score_characters(
     evidence: Column, places: Column, bits: int, parity: int, likeliest: bool, out: Column
 ) -> None:
-    """Log-likelihood ratio of a character that starts at a tick, of any bits, against a light that stands.
+    """Compute the log-likelihood ratio of any character that starts at a tick and of a constant light.
 
-    It may stand as for a mark, or as for a space: a long pause is less noisy than the marks that follow an
-    edge, and is no character for that.
+    The light may stay at mark or at space: a long pause has less noise than the marks after an edge, and is
+    no character for that.
 
     Args:
-        evidence: Of every tick and context, whose binary digits are the bits before and that of the window,
-            float64 (n, C).
+        evidence: Log-likelihoods of every tick and context, float64 (n, C).
         places: Ticks from the start of a character to each of its bits, int64 (bits on air,).
         bits: Data bits.
-        parity: 0 none, 1 odd, 2 even: the parity bit makes the number of ones so.
-        likeliest: Take the likeliest bits alone instead of the mean over all.
-        out: Of every tick, float64 (m,), with m + the last place <= n.
+        parity: Parity of the ones: 0 none, 1 odd, 2 even.
+        likeliest: Whether to take the likeliest bits instead of the mean over all.
+        out: The ratios, float64 (m,), with m + the last place <= n.
     """
     fair = -bits * math.log(2.0)
     n, contexts = evidence.shape
     by_context = np.ascontiguousarray(evidence.T)
-    # Sums are of likelihoods, of which the greatest of a tick is 1: of no word they are too small.
+    # Likelihoods are scaled to at most 1 per tick, so that no sum underflows.
     tops = np.empty(0 if likeliest else n)
     likely = np.empty((contexts, len(tops)))
     for s in range(len(tops)):
         tops[s] = evidence[s].max()
         for c in range(contexts):
             likely[c, s] = math.exp(evidence[s, c] - tops[s])
-    # A state is the parity of the ones so far and the last bits.
+    # A state is the parity of the ones so far, and the last bits.
     states = np.empty((2, 2, contexts // 2, _AT_ONCE))
     sums = np.empty(_AT_ONCE)
     for first in range(0, len(out), _AT_ONCE):
         some = out[first : first + _AT_ONCE]
-        _words(by_context, places, bits, parity, True, first, states, some)
-        # The mean over all words matters only where a character may be.
+        _score_words(by_context, places, bits, parity, True, first, states, some)
+        # The mean over all words matters only if a character is possible.
         if not likeliest and some.max() > 0:
-            _words(likely, places, bits, parity, False, first, states, sums[: len(some)])
+            _score_words(likely, places, bits, parity, False, first, states, sums[: len(some)])
             for k in range(len(some)):
                 if some[k] > 0:
                     some[k] = math.log(sums[k])
@@ -127,7 +126,7 @@ def character_scores(
 
 
 @njit
-def _words(
+def _score_words(
     by_context: Column,
     places: Column,
     bits: int,
@@ -137,23 +136,23 @@ def _words(
     states: Column,
     out: Column,
 ) -> None:
-    """The likeliest word at some ticks by log-likelihoods, or the sum of all words' likelihoods.
+    """Score the likeliest word at some ticks by log-likelihoods, or sum the likelihoods of all words.
 
     Args:
-        by_context: Of every context and tick, float64 (C, n).
+        by_context: Log-likelihoods or likelihoods of every context and tick, float64 (C, n).
         places: Ticks from the start of a character to each of its bits, int64 (bits on air,).
         bits: Data bits.
         parity: 0 none, 1 odd, 2 even.
-        likeliest: The likeliest word, not the sum.
+        likeliest: Whether to score the likeliest word, or else the sum.
         first: The first of the ticks.
-        states: Room to work in, float64 (2, 2, C / 2, >= m).
-        out: Of each of the ticks, float64 (m,).
+        states: Room, float64 (2, 2, C / 2, >= m).
+        out: The scores, float64 (m,).
     """
     known = states.shape[2]
     n = len(out)
     none = -np.inf if likeliest else 0.0
     states[0] = none
-    # Before the start bit there was mark.
+    # There is mark before the start bit.
     states[0, 0, known - 2, :n] = by_context[2 * known - 2, first : first + n]
     now = 0
     for b in range(1, len(places)):
@@ -184,7 +183,7 @@ def _words(
 
 
 @njit
-def best_path(
+def find_best_path(
     scores: Column,
     tails: Column,
     length: int,
@@ -196,25 +195,24 @@ def best_path(
     pause: int,
     after_pause: float,
 ) -> tuple[Column, float]:
-    """Starts of the characters that explain a stretch best, and how much better than none.
+    """Find the characters that explain a stretch best.
 
     Args:
-        scores: Of a character that starts at each tick, float64 (n,).
-        tails: What a pause that begins at each tick is worth: edges before it go on into it, float64 (>= n,).
+        scores: Score of a character that starts at each tick, float64 (n,).
+        tails: Score of a pause that starts at each tick, with the tails of edges before it, float64 (>= n,).
         length: Ticks from a character's start to the end of its last stop bit.
         first: The first tick at which one may start.
-        near: Ticks by which one may follow another early or late and still count as following it at once.
-        after_idle: What a character costs that follows a pause.
-        after_one: What one costs that follows another at once.
-        jitter: What a tick early or late costs.
-        pause: Ticks between the end of one and the start of another behind the pause that is sent; 0: none.
-        after_pause: What one costs behind just that pause.
+        near: Most ticks by which a successive character is early or late.
+        after_idle: Cost of a character after a pause.
+        after_one: Cost of a successive character.
+        jitter: Cost of a tick early or late.
+        pause: Ticks of the stated pause; 0 without one.
+        after_pause: Cost of a character after just that pause.
 
     Returns:
-        The starts, int64 (m,), and the score of the path.
+        The starts, int64 (m,), and the score of the path relative to that of no characters.
     """
     n = len(scores)
-    # Ends of characters lie up to `length` and the nearness behind the last start.
     idle = np.zeros(n + 1)
     ended = np.full(n + length + 1, -np.inf)
     of_idle = np.full(n + 1, -1, np.int64)

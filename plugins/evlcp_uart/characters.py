@@ -1,4 +1,4 @@
-"""Characters on air: their bits, their chips, and how likely each is by the edges that are seen."""
+"""The format of characters: their bits on air, and the likelihood of each by the evidence of its bits."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +17,7 @@ BitOrder = Literal["lowest", "highest"]
 class Characters:
     """The format of a character: a start bit, data bits, parity, stop bits.
 
-    Data begin with the least significant bit, as a serial port's do, or with the most significant one.
+    Data start with the least significant bit, as of a serial port, or with the most significant one.
 
     >>> Characters(7, "even", 2).levels()[0x43].tolist()
     [0, 1, 1, 0, 0, 0, 0, 1, 1, 1, 1]
@@ -36,7 +36,7 @@ class Characters:
         return 1 + self.data_bits + (self.parity != "none") + self.stop_bits
 
     def levels(self) -> NDArray[np.uint8]:
-        """Every character, 1 for mark, uint8 (2**data_bits, bits)."""
+        """Return the bits of every character, 1 for mark, uint8 (2**data_bits, bits)."""
         values = np.arange(1 << self.data_bits)
         shifts = np.arange(self.data_bits)
         data = (values[:, None] >> (shifts if self.first == "lowest" else shifts[::-1])) & 1
@@ -49,38 +49,40 @@ class Characters:
 
     @cached_property
     def contexts(self) -> Ticks:
-        """Context of each bit of every character, int64 (2**data_bits, bits); before it there was mark."""
-        return _contexts(self.levels())
+        """Context of each bit of every character after a mark, int64 (2**data_bits, bits)."""
+        return _find_contexts(self.levels())
 
     def likelihoods(self, evidence: Floats) -> Floats:
-        """Log-likelihood of every character, float64 (n, 2**data_bits).
+        """Return the log-likelihood of every character, float64 (n, 2**data_bits).
 
         Args:
             evidence: Log-likelihood of each context at each bit, float64 (n, bits, C).
         """
-        return _likelihoods(evidence, self.contexts)
+        return _sum_evidence(evidence, self.contexts)
 
-    def wrong_parity(self, evidence: Floats) -> NDArray[np.bool_]:
-        """Whether the bits that are likeliest by themselves have the wrong parity, bool (n,)."""
+    def has_wrong_parity(self, evidence: Floats) -> NDArray[np.bool_]:
+        """Return whether the likeliest bits without the parity have the wrong one, bool (n,)."""
         if self.parity == "none":
             return np.zeros(len(evidence), np.bool_)
         other = self.levels()
         other[:, 1 + self.data_bits] ^= 1
         right = self.likelihoods(evidence).max(1, initial=-np.inf)
-        wrong: NDArray[np.bool_] = _likelihoods(evidence, _contexts(other)).max(1, initial=-np.inf) > right
+        wrong: NDArray[np.bool_] = (
+            _sum_evidence(evidence, _find_contexts(other)).max(1, initial=-np.inf) > right
+        )
         return wrong
 
-    def framed(self, evidence: Floats) -> Floats:
-        """How much likelier some character is than any bits, start, parity and stop bits free, float64 (n,).
+    def frame_evidence(self, evidence: Floats) -> Floats:
+        """Return the log-likelihood ratio of any character and of free bits, nats, float64 (n,).
 
-        In nats: where the light says it all, ln 2 for each of these bits.
+        Perfect evidence gives ln 2 for each start, parity and stop bit.
         """
         many, bits, contexts = evidence.shape
         states = np.full((many, contexts // 2), -np.inf)
         states[:, -1] = 0.0
         for bit in range(bits):
             grown = np.repeat(states, 2, 1) + evidence[:, bit]
-            # The oldest bit is forgotten.
+            # Sum over the oldest bit.
             states = np.logaddexp(grown[:, : contexts // 2], grown[:, contexts // 2 :])
         any_bits = np.logaddexp.reduce(states, 1) - bits * np.log(2)
         words = np.logaddexp.reduce(self.likelihoods(evidence), 1) - self.data_bits * np.log(2)
@@ -88,14 +90,14 @@ class Characters:
         return found
 
     def clearness(self, evidence: Floats) -> float:
-        """How clear the data bits of characters are, 0 to 1."""
+        """Return how clear the data bits of characters are, 0 to 1."""
         likelihoods = self.likelihoods(evidence)
         logs = likelihoods - np.logaddexp.reduce(likelihoods, 1)[:, None]
         unknown = -(np.exp(logs) * logs).sum() / np.log(2)
         return float(1 - unknown / (self.data_bits * len(evidence)))
 
-    def soft(self, likelihoods: Floats) -> tuple[Ticks, NDArray[np.float32], Floats]:
-        """The likeliest of each, with how sure, from log-likelihoods of every character, (n, 2**data_bits).
+    def decide(self, likelihoods: Floats) -> tuple[Ticks, NDArray[np.float32], Floats]:
+        """Decide on characters by the log-likelihoods of all of them, (n, 2**data_bits).
 
         Returns:
             The likeliest characters, int64 (n,); LLRs ln P(0) / P(1) of their data bits, most significant
@@ -112,7 +114,7 @@ class Characters:
         return best, llr.astype(np.float32), 1 / total
 
 
-def _contexts(levels: NDArray[np.uint8]) -> Ticks:
+def _find_contexts(levels: NDArray[np.uint8]) -> Ticks:
     known = np.pad(levels.astype(np.int64), ((0, 0), (BEFORE, 0)), constant_values=1)
     bits = levels.shape[1]
     found = np.zeros(levels.shape, np.int64)
@@ -121,7 +123,7 @@ def _contexts(levels: NDArray[np.uint8]) -> Ticks:
     return found
 
 
-def _likelihoods(evidence: Floats, contexts: Ticks) -> Floats:
+def _sum_evidence(evidence: Floats, contexts: Ticks) -> Floats:
     bits = np.arange(contexts.shape[1])
     found: Floats = evidence[:, bits, contexts].sum(2)
     return found

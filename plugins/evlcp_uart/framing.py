@@ -1,4 +1,4 @@
-"""The framing `uart`: a frame is a character, a packet some of them behind a pause."""
+"""The framing `uart`: a frame is a character, a packet some of them after a pause."""
 
 import math
 from collections.abc import Mapping
@@ -19,8 +19,8 @@ from evlcp_uart.characters import BitOrder, Characters, Parity
 from evlcp_uart.decoder import Character, CharacterDecoder, CharacterState
 from evlcp_uart.reader import CLOCK_SHARE, CharacterReader
 
-_PIECE = 1 << 16
-"""Events that are taken at once from an array."""
+_PIECE_EVENTS = 1 << 16
+"""Events of a step."""
 
 
 @dataclass(frozen=True)
@@ -69,24 +69,23 @@ class Uart(Framing):
         return Codebook(profile, pause, np.empty((1, 0), np.uint8), levels if mark else 1 - levels)
 
     def infer(self, events: Events) -> tuple[Mapping[str, Any], str]:
-        """Rate and format by the events of one light, where random bits do not look like that."""
-        from evlcp_uart.inference import infer
+        """Infer rate and format from the events of one light, if random bits would not look the same."""
+        from evlcp_uart.inference import infer_format
 
-        return infer(events.t_us, events.p)
+        return infer_format(events.t_us, events.p)
 
     def rest(self) -> int:
         """A mark, as in pauses: anything else would be characters."""
         return int(self.idle == "on")
 
-    def decoder(self, bit_rate_hz: float) -> CharacterDecoder:
-        """What reads characters from events."""
-        return CharacterDecoder(
-            CharacterReader(self.characters, self.pause_bits), 1e6 / bit_rate_hz, self.idle == "on"
-        )
+    def make_decoder(self, bit_rate_hz: float) -> CharacterDecoder:
+        """Make the decoder of events to characters."""
+        reader = CharacterReader(self.characters, self.pause_bits)
+        return CharacterDecoder(reader, 1e6 / bit_rate_hz, self.idle == "on")
 
     def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer:
-        """For the packet's length and the rate of its chips."""
-        return _Packets(self.decoder(packet.chip_rate_hz), packet)
+        """Compile for the length of the packet and the rate of its chips."""
+        return _PacketFramer(self.make_decoder(packet.chip_rate_hz), packet)
 
 
 def read_characters(
@@ -98,15 +97,18 @@ def read_characters(
         t_us: Event times, ascending, us, int64 (n,).
         p: Polarities, 1 for brighter, uint8 (n,).
         bit_rate_hz: Bits a second on air; the clock may be off by 2.5 percent.
-        uart: Their format; None for eight data bits, no parity, one stop bit.
+        uart: The format; None for eight data bits, no parity, one stop bit.
 
     >>> read_characters(np.array([5, 7]), np.array([1, 0], np.uint8), 3125.0)
     []
     """
-    decoder = (Uart() if uart is None else uart).decoder(bit_rate_hz)
+    decoder = (Uart() if uart is None else uart).make_decoder(bit_rate_hz)
     state, found = decoder.init(), []
-    for k in range(0, len(t_us), _PIECE):
-        t, q = np.asarray(t_us[k : k + _PIECE], np.int64), np.asarray(p[k : k + _PIECE], np.uint8)
+    for k in range(0, len(t_us), _PIECE_EVENTS):
+        t, q = (
+            np.asarray(t_us[k : k + _PIECE_EVENTS], np.int64),
+            np.asarray(p[k : k + _PIECE_EVENTS], np.uint8),
+        )
         state, more = decoder.step(state, t, q, int(t[-1]))
         found += more
     return found + decoder.close(state)[1]
@@ -114,10 +116,15 @@ def read_characters(
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """State of the decoder, characters that wait for a packet to begin, and where packets stand.
+    """The state of the decoder and of the packets.
 
-    That is the start of the first character of one, us, and its number; packet, place and end of the last
-    character; and whether the pause that is stated was seen.
+    Attributes:
+        decoder: State of the decoder.
+        waiting: Characters before the first known start of a packet.
+        grid: Start of the first character of a packet, us, and the number of the packet.
+        last: Packet and place of the last character.
+        end_us: End of the last character.
+        pauses: Whether the stated pause was seen.
     """
 
     decoder: CharacterState
@@ -129,8 +136,8 @@ class _State:
 
 
 @dataclass(frozen=True)
-class _Packets:
-    """Numbers characters by packets: some follow one another, then there is a pause."""
+class _PacketFramer:
+    """Numbers the characters of packets, which pauses separate."""
 
     decoder: CharacterDecoder
     packet: PacketFormat
@@ -140,21 +147,22 @@ class _Packets:
 
     def step(self, state: _State, events: Events, until_us: int) -> tuple[_State, list[DecodedFrame]]:
         decoder, found = self.decoder.step(state.decoder, events.t_us, events.p, until_us)
-        return self._number(replace(state, decoder=decoder), found)
+        return self._assign_packets(replace(state, decoder=decoder), found)
 
     def close(self, state: _State) -> tuple[_State, list[DecodedFrame]]:
         decoder, found = self.decoder.close(state.decoder)
-        return self._number(replace(state, decoder=decoder), found, is_last=True)
+        return self._assign_packets(replace(state, decoder=decoder), found, is_last=True)
 
     def counts(self, state: _State) -> Mapping[str, int]:
-        return state.decoder.given
+        return state.decoder.tally
 
-    def _number(
+    def _assign_packets(
         self, state: _State, found: list[Character], is_last: bool = False
     ) -> tuple[_State, list[DecodedFrame]]:
-        """Characters by packet and place in it, once one begins; one off the grid begins the next.
+        """Number characters by packet and place, from the first known start on; one off the grid starts a
+        packet.
 
-        So does what follows a whole packet, while no pause was the one that is stated: it may be longer.
+        So does one after a whole packet, until the stated pause was seen: the real one may be longer.
         """
         waiting, grid, last = (*state.waiting, *found), state.grid, state.last
         end_us, pauses = state.end_us, state.pauses
@@ -162,34 +170,36 @@ class _Packets:
             start_us = self._find_start(waiting)
             if start_us is None and not is_last:
                 return replace(state, waiting=waiting), []
-            # Without a pause nothing tells where a packet begins; those before it count from 0.
+            # Without a pause the start of a packet is unknown; earlier characters count from 0.
             start_us = waiting[0].t_us if start_us is None else start_us
             earlier = (start_us - waiting[0].t_us) / (waiting[0].bit_us * self.packet.packet_chips)
             grid = start_us, math.ceil(earlier - 0.05)
         frames = []
-        for one in waiting:
+        for character in waiting:
             assert grid is not None
-            packets, rest = divmod((one.t_us - grid[0]) / one.bit_us + 1, self.packet.packet_chips)
+            packets, rest = divmod(
+                (character.t_us - grid[0]) / character.bit_us + 1, self.packet.packet_chips
+            )
             place = (rest - 1) / self.packet.info_chips
             frame, packet = round(place), grid[1] + int(packets)
             off = abs(place - frame) * self.packet.info_chips
-            pauses |= abs((one.t_us - end_us) / one.bit_us - self.packet.preamble_chips) < 0.75
+            pauses |= abs((character.t_us - end_us) / character.bit_us - self.packet.preamble_chips) < 0.75
             is_whole = last[1] == self.packet.frames - 1 and not pauses
             if off > 0.75 or is_whole or frame >= self.packet.frames or (packet, frame) <= last:
                 packet, frame = last[0] + 1, 0
-            grid = one.t_us - frame * self.packet.info_chips * one.bit_us, packet
-            last, end_us = (packet, frame), one.t_us + self.packet.info_chips * one.bit_us
-            soft = SoftSymbols(np.array([one.value]), one.llr[None], one.quality)
-            start_us = grid[0] - self.packet.preamble_chips * one.bit_us
-            frames.append(DecodedFrame(packet, frame, start_us, one.t_us, one.bit_us, soft))
+            grid = character.t_us - frame * self.packet.info_chips * character.bit_us, packet
+            last, end_us = (packet, frame), character.t_us + self.packet.info_chips * character.bit_us
+            soft = SoftSymbols(np.array([character.value]), character.llr[None], character.quality)
+            start_us = grid[0] - self.packet.preamble_chips * character.bit_us
+            frames.append(DecodedFrame(packet, frame, start_us, character.t_us, character.bit_us, soft))
         return replace(state, grid=grid, waiting=(), last=last, end_us=end_us, pauses=pauses), frames
 
     def _find_start(self, waiting: tuple[Character, ...]) -> float | None:
-        """Where a packet begins, us: behind the pause before it, or the first of more than it has."""
-        for k, (before, one) in enumerate(pairwise(waiting), 1):
-            pause = (one.t_us - before.t_us) / one.bit_us - self.packet.info_chips
+        """Return the start of a packet, us: after its pause, or the first of more characters than it has."""
+        for k, (before, character) in enumerate(pairwise(waiting), 1):
+            pause = (character.t_us - before.t_us) / character.bit_us - self.packet.info_chips
             if abs(pause - self.packet.preamble_chips) < 0.75:
-                return one.t_us
+                return character.t_us
             if k == self.packet.frames:
                 return waiting[0].t_us
         return None

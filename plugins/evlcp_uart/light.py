@@ -1,4 +1,4 @@
-"""What a decoder knows of the light and of the pixels that see it: events by the bits around them."""
+"""A model of the light and of the pixels that see it: events by the bits around them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,59 +14,58 @@ TICKS = 16
 """Ticks of a bit."""
 
 BEFORE = 3
-"""Bits before one that its events depend on."""
+"""Earlier bits that the events of a bit depend on."""
 
 CONTEXTS = 2 << BEFORE
-"""Contexts of a bit: the number whose binary digits are those before it and the bit itself, 1 for mark."""
+"""Contexts of a bit: the number of the bits before it and the bit itself as binary digits, 1 for mark."""
 
 EARLY = 3
-"""Tick of a bit at which the first events of its edge come: where an edge is, only events tell."""
+"""Tick of a bit with the first events of its edge; only events show where an edge is."""
 
 GAINS = np.array([0.02, 0.25, 0.5, 1.0, 2.0, 4.0])
 LOG_GAINS = np.log(GAINS)
 _SHARES = np.array([0.02, 0.12, 0.2, 0.4, 0.2, 0.06])
-"""Windows of a context are unlike in strength: by its mean, and how likely each is before any are seen."""
+"""Strengths of the windows of a context relative to its mean, and their prior probabilities."""
 
 OUTLIER = 2e-3
-"""Probability that the events of a bit are of something else."""
+"""Probability that the events of a bit have another cause."""
 
 _PRIOR_WINDOWS, _PRIOR_GAINS = 3.0, 12.0
-"""Windows of a context for which those with the same last bits stand, and for which the shares do."""
+"""Weights, in windows of a context, of those with the same last bits, and of the prior shares."""
 
 _ENOUGH = 30.0
-"""Events of a window that tell all that it says: of more, each counts less, as pixels share the light."""
+"""Events of a window that tell all; of more, each has less weight, as pixels share the light."""
 
 _COUNTED = 0.85
-"""What an event counts at most: light is learned from the very bits that are read by it, and a pixel's events
-hang together."""
+"""Most weight of an event: light is learned from the bits that are read with it, and the events of a pixel
+are correlated."""
 
 _FLOOR = 0.004
 """Share of the mean events of a tick that may come in any."""
 
 _BLUR = np.array([1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0]) / 16
-"""What is learned of a tick tells of those beside it: cameras read events out in bursts, and a character's
-start is known to a tick or two. Without it bits would be distinguished by when their events were read out."""
+"""Kernel to smooth rates over ticks: cameras read events out in bursts, and a character's start is known to a
+tick or two. Without it bits would be distinguished by the readout times of their events."""
 
 _QUARTER, _STEADY_SHARE = TICKS // 4, 0.4
-"""Ticks of a quarter of a bit, and the share of these that are surely without a burst: what comes in them is
-of something else."""
+"""Ticks of a quarter of a bit, and the share of quarters that are surely without a burst, only with noise."""
 
 _PAUSES = 6.0
-"""Characters for which a stream without pauses stands."""
+"""Weight of the prior without pauses, in characters."""
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """What is known, as sums over the bits that were read, those long ago counting less.
+    """The model, as sums over the bits read so far, older ones with less weight.
 
     Attributes:
         events: Events of each context, by polarity and tick, OFF and ON, float64 (C, 2, TICKS).
-        windows: Bits of each context, each by its gain, float64 (C,).
+        windows: Bits of each context, weighted by their gains, float64 (C,).
         gains: Bits of each context and gain, float64 (C, J).
-        rate: Length of a bit against the nominal one.
-        paused: Characters behind a pause, their ticks of pause in all, and characters.
-        most: What an event counts at most.
-        inverted: It is on when the link has it off, and off when on.
+        rate: Length of a bit relative to the nominal one.
+        paused: Number of characters after a pause, the sum of the pauses in ticks, and number of characters.
+        most: Most weight of an event.
+        inverted: Whether it is on when the link has it off, and off when on.
     """
 
     events: Floats
@@ -78,8 +77,8 @@ class Light:
     inverted: bool = False
 
     @property
-    def learned(self) -> float:
-        """Bits that it was learned from."""
+    def learned_bits(self) -> float:
+        """Number of bits that it was learned from."""
         return float(self.windows.sum())
 
     @cached_property
@@ -89,23 +88,23 @@ class Light:
         bits = self.gains.sum(1)
         found = mean[None]
         for depth in range(1, BEFORE + 2):
-            # Those with one more bit before, where there are too few of them stand those without.
+            # Contexts of one more bit, with those of one less as their prior.
             events = self.events.reshape(-1, 1 << depth, 2, TICKS).sum(0)
             windows = self.windows.reshape(-1, 1 << depth).sum(0)
             many = bits.reshape(-1, 1 << depth).sum(0)
-            # Windows count by their gain: where bits are silent as a rule, those of the prior do, too.
+            # Windows count by their gain; if bits are mostly silent, those of the prior do so, too.
             known = _PRIOR_WINDOWS * np.where(many > 0, windows / np.maximum(many, 1e-9), 1.0)
             known = np.maximum(known, _PRIOR_WINDOWS * GAINS[0])
             prior = np.tile(found, (2, 1, 1))
             found = (events + known[:, None, None] * prior) / (windows + known)[:, None, None]
         floor = _FLOOR * float(mean.mean()) + 1e-5
-        rates: Floats = _smooth(found) + floor
+        rates: Floats = _smooth_rates(found) + floor
         return rates
 
     @cached_property
     def share(self) -> float:
-        """What an event counts."""
-        # What comes in every context is of something else than the light.
+        """Weight of an event."""
+        # Events of all contexts have other causes than the light.
         informative = self.rates - self.rates.min(0)
         return min(self.most, _ENOUGH / max(float(informative.sum((1, 2)).max()), 1e-9))
 
@@ -117,10 +116,7 @@ class Light:
 
     @cached_property
     def means(self) -> Floats:
-        """What a window costs by context and gain: its mean events, by what they count, and the gain.
-
-        float64 (C, J).
-        """
+        """Cost of a window by context and gain: its mean events, weighted, and the gain, float64 (C, J)."""
         shares = self.gains + _PRIOR_GAINS * _SHARES
         shares /= shares.sum(1, keepdims=True)
         found: Floats = self.rates.sum((1, 2))[:, None] * GAINS * self.share - np.log(shares)
@@ -128,67 +124,67 @@ class Light:
 
     @property
     def costs(self) -> tuple[float, float]:
-        """What a character costs after a pause and at once after another."""
+        """Costs of a character after a pause, and of one that follows another."""
         paused, ticks, many = self.paused
         share = (paused + 0.02) / (many + _PAUSES)
         length = (ticks + 4 * TICKS) / (paused + 1)
         after_idle = float(np.clip(np.log(length / share), 10.0, 12.0))
         return after_idle, float(np.clip(-np.log(1 - share), 0.1, 3.0)) if many else 1.0
 
-    def of_context(self, windows: Floats) -> tuple[Floats, Floats, Ticks]:
-        """Log-likelihood of windows by context, over gains, and how likely each gain is.
+    def context_likelihoods(self, windows: Floats) -> tuple[Floats, Floats, Ticks]:
+        """Return log-likelihoods of windows by context, summed over gains, and the probability of each gain.
 
-        What the gains make of a window depends on how many events it has, not on when they come.
+        The effect of gains depends on the number of events of a window, not on their times.
 
         Args:
             windows: Whole numbers of events, float64 (n, 2, TICKS).
 
         Returns:
-            Log-likelihoods, float64 (n, C); of each number of events how likely each gain is, by context,
-            float64 (m, C, J); and which of these numbers a window has, int64 (n,).
+            Log-likelihoods, float64 (n, C); for each number of events the probability of each gain, by
+            context, float64 (m, C, J); and the index of that number for each window, int64 (n,).
         """
         flat = windows.reshape(len(windows), -1)
         events, which = np.unique(flat.sum(1), return_inverse=True)
-        worth = events[:, None, None] * (self.share * LOG_GAINS) - self.means
-        over = log_sums(worth)
+        score = events[:, None, None] * (self.share * LOG_GAINS) - self.means
+        over = log_sum_exp(score)
         alike = np.einsum("nk,ck->nc", flat, self.share * self.logs.reshape(CONTEXTS, -1))
-        return alike + over[which], np.exp(worth - over[..., None]), which
+        return alike + over[which], np.exp(score - over[..., None]), which
 
-    def beside_mean(self, windows: Floats) -> Floats:
-        """Log-likelihood of windows, float64 (n, 2, TICKS), of each context beside steady events, (n, C)."""
+    def likelihood_ratios(self, windows: Floats) -> Floats:
+        """Return log-likelihood ratios of windows (n, 2, TICKS) by context and as noise, float64 (n, C)."""
         share = self.windows / self.windows.sum()
         mean = np.einsum("c,cpt->p", share, self.rates)[:, None] / TICKS * np.ones(TICKS)
         gains = self.gains.sum(0) + _PRIOR_GAINS * _SHARES
         costs = mean.sum() * GAINS * self.share - np.log(gains / gains.sum())
         flat = windows.reshape(len(windows), -1)
         alike = np.einsum("nk,k->n", flat, np.log(mean).ravel())
-        worth = self.share * (alike[:, None] + flat.sum(1)[:, None] * LOG_GAINS) - costs
-        return self.of_context(windows)[0] - log_sums(worth)[:, None]
+        score = self.share * (alike[:, None] + flat.sum(1)[:, None] * LOG_GAINS) - costs
+        return self.context_likelihoods(windows)[0] - log_sum_exp(score)[:, None]
 
-    def explained(self, windows: Floats, contexts: Floats) -> float:
-        """How much the events of bits tell of their contexts, in all: their mutual information.
+    def mutual_information(self, windows: Floats, contexts: Floats) -> float:
+        """Return the mutual information of the events of bits and their contexts, summed, nats.
 
         Args:
             windows: Events of each bit, float64 (n, 2, TICKS).
-            contexts: How likely each is of each context, float64 (n, C).
+            contexts: Probability of each context of a bit, float64 (n, C).
         """
-        likely = _likely(self.of_context(windows)[0])
+        likely = _normalize_likelihoods(self.context_likelihoods(windows)[0])
         any_of = likely @ contexts.mean(0)
         found: float = (contexts * np.log(likely + 1e-300)).sum() - np.log(any_of + 1e-300).sum()
         return found
 
     def learn(self, windows: Floats, contexts: Floats, memory: float, rate: float) -> "Light":
-        """With what more bits teach.
+        """Return the model with more bits.
 
         Args:
             windows: Events of each bit, float64 (n, 2, TICKS).
-            contexts: How likely each is of each context, float64 (n, C).
-            memory: What all before counts.
-            rate: Length of a bit against the nominal one.
+            contexts: Probability of each context of a bit, float64 (n, C).
+            memory: Weight of all earlier bits.
+            rate: Length of a bit relative to the nominal one.
         """
-        logs, gains, which = self.of_context(windows)
-        likely = _likely(logs)
-        # What is rather something else than a bit of that context teaches nothing of it.
+        logs, gains, which = self.context_likelihoods(windows)
+        likely = _normalize_likelihoods(logs)
+        # A window that is likelier an outlier teaches nothing of a context.
         fits = (1 - OUTLIER) * likely / likely.max(1, keepdims=True)
         contexts = contexts * fits / (fits + OUTLIER)
         at = (which[:, None] * CONTEXTS + np.arange(CONTEXTS)).ravel()
@@ -204,32 +200,32 @@ class Light:
         )
 
 
-def guesses(counts: NDArray[np.int32], mark_on: bool) -> Iterator[Light]:
-    """What the light may be like, before anything is known.
+def guess_lights(counts: NDArray[np.int32], mark_on: bool) -> Iterator[Light]:
+    """Yield guesses of a light before anything is known of it.
 
     Args:
         counts: Events of each tick, OFF and ON, int32 (2, n).
-        mark_on: The light is on for a mark.
+        mark_on: Whether the light is on for a mark.
     """
     n = counts.shape[1]
     ticks = np.arange(2 * TICKS)
     total = counts.sum(1) + 1.0
-    # In half of the quarters of bits there is no edge's burst, whatever is sent.
+    # Half of the quarters of bits have no burst, whatever is sent.
     quarters = counts[:, : n - n % _QUARTER].reshape(2, -1, _QUARTER).sum(2)
     steady = np.quantile(quarters, _STEADY_SHARE, axis=1) / _QUARTER
     noise = np.maximum(np.maximum(0.2 * total / n, steady), 1e-3)
-    # A rise in four bits or so.
+    # About one rise in four bits.
     events = np.maximum((total - np.maximum(steady - 0.2 * total / n, 0.0) * n) / (n / TICKS / 4), 1.0)
     shares = np.tile(2 * _SHARES, (CONTEXTS, 1))
-    for glow, trail, lates in (
+    for glow, trail, delays in (
         (0.0, 0.0, (-1.0, -0.5, 0.0, 0.5, 1.0)),
         (0.4, 0.0, (-0.5, 0.0, 0.5)),
         (0.0, 0.25, (-0.5, 0.0, 0.5)),
     ):
         for width in (0.12, 0.5):
-            for later in lates:
+            for delay in delays:
                 rates = np.empty((CONTEXTS, 2, TICKS))
-                for on, shift in enumerate((max(-later, 0.0), max(later, 0.0))):
+                for on, shift in enumerate((max(-delay, 0.0), max(delay, 0.0))):
                     after = (ticks - EARLY) / TICKS - shift
                     burst = np.where(after >= 0, np.exp(-np.maximum(after, 0) / width), 0.02)
                     burst *= events[on] / burst.sum()
@@ -243,27 +239,27 @@ def guesses(counts: NDArray[np.int32], mark_on: bool) -> Iterator[Light]:
                             rates[context, on] += burst[:TICKS]
                         elif bits == [1 - on, on, on]:
                             rates[context, on] += burst[TICKS:]
-                        # A light that moves, or shimmers, wakes events of both polarities while it is on.
+                        # A light that moves or shimmers triggers events of both polarities while it is on.
                         rates[context, on] += glow * bits[2] * events[on] / TICKS
-                        # Bright pixels go on and on after an edge.
+                        # Bright pixels send more events long after an edge.
                         rates[context, on] += trail * (bits[2] == bits[1] == on) * events[on] / TICKS
                 yield Light(2 * rates, np.full(CONTEXTS, 2.0), shares)
 
 
-def log_sums(logs: Floats) -> Floats:
-    """Logarithms of sums along the last axis, from logarithms, of which one at least is finite."""
+def log_sum_exp(logs: Floats) -> Floats:
+    """Return logarithms of sums along the last axis, from logarithms, at least one of them finite."""
     top = logs.max(-1, keepdims=True)
     found: Floats = np.log(np.einsum("...j->...", np.exp(logs - top))) + top[..., 0]
     return found
 
 
-def _likely(logs: Floats) -> Floats:
-    """Likelihoods from their logarithms, float64 (n, C), the greatest of each window 1."""
+def _normalize_likelihoods(logs: Floats) -> Floats:
+    """Return likelihoods from their logarithms, the greatest of each window 1, float64 (n, C)."""
     likely: Floats = np.exp(logs - logs.max(1, initial=-np.inf, keepdims=True))
     return likely
 
 
-def _smooth(rates: Floats) -> Floats:
+def _smooth_rates(rates: Floats) -> Floats:
     padded = np.pad(rates, ((0, 0), (0, 0), (len(_BLUR) // 2,) * 2), mode="edge")
     found: Floats = np.lib.stride_tricks.sliding_window_view(padded, len(_BLUR), 2) @ _BLUR
     return found

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import BackgroundSpec, Scene, Simulation, _kernels
-from evlcp_sdk.sim.simulation import request_words
+from evlcp_sdk.sim.simulation import pack_requests
 from evlcp_sdk.values import Events
 
 Floats = NDArray[np.float64]
@@ -57,7 +57,7 @@ def pixel_events(sensor, edge_us, light_w_m2, end_us, *, pixels=1, seed=0):
         bars=(),
     )
     simulation = Simulation(scene)
-    prepared = simulation._prepare(0, 0.0, 1000.0)
+    prepared = simulation._prepare_block(0, 0.0, 1000.0)
     assert prepared is not None
     active, (_, strips, halos, near, scenery) = prepared
     number = np.arange(pixels, dtype=np.int32)
@@ -74,7 +74,7 @@ def pixel_events(sensor, edge_us, light_w_m2, end_us, *, pixels=1, seed=0):
     )
     scenery = scenery._replace(field=np.ones_like(scenery.field), light=np.array([0.0, 1.0]))
     world = (line, strips, halos, near, scenery)
-    parts = [part for job in simulation._jobs((active, world), begin_us, end_us) for part in job()]
+    parts = [part for job in simulation._make_jobs((active, world), begin_us, end_us) for part in job()]
     request, code = (np.concatenate(column) for column in zip(*parts, strict=True))
     row, column = code >> _kernels.COLUMN_BITS + 1, code >> 1 & (1 << _kernels.COLUMN_BITS) - 1
     pixel = row * np.int64(_WIDTH) + column
@@ -111,7 +111,7 @@ def latency_with_readout_us(sensor, light_w_m2, side_px, *, seed=0):
 def words_of(t_us, row, column):
     """Requests of ON events, as the readout takes them."""
     code = (np.asarray(row) << _kernels.COLUMN_BITS | np.asarray(column)) << 1 | 1
-    return request_words(np.asarray(t_us, np.float64), code.astype(np.int32), 0.0)
+    return pack_requests(np.asarray(t_us, np.float64), code.astype(np.int32), 0.0)
 
 
 def serve_requests(words, height, row_us, *, until_us=np.inf, limit=(0, 200), memory=None, pending=None):

@@ -4,7 +4,7 @@ import math
 
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import resolve_scene, truth_from_table
-from evlcp_sdk.sim.record import OF_SENSOR
+from evlcp_sdk.sim.record import SENSOR_KEYS
 
 
 def scene_of_truth(truth):
@@ -42,7 +42,7 @@ def scene_of_truth(truth):
             for x, y, right, down, radius, bend in given.get("drops", ())
         ],
         "sensor": {
-            **_take_keys(given, OF_SENSOR),
+            **_take_keys(given, SENSOR_KEYS),
             "hot_share": given["hot_pixels"] / (camera["width"] * camera["height"]),
         },
         "bars": [_bar_spec_of(*both, given) for both in zip(truth["bars"], sent, strict=True)],

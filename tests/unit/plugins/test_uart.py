@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from evlcp_uart import _kernels
 from evlcp_uart.framing import Uart, read_characters
-from evlcp_uart.inference import infer
+from evlcp_uart.inference import infer_format
 from evlcp_uart.light import TICKS
 
 import evlcp_sdk as evlcp
@@ -159,7 +159,7 @@ def test_a_stream_that_begins_within_a_character_gives_none_that_was_not_sent(cu
         levels += levels_of(np.array([value]), 8, "even", 1) + [1] * (pause if k % 5 == 1 else 0)
     events = light_of_bytes(rng, levels, bit_us, late_us=(20.0, 30.0), noise_hz=0.0, start_us=0.0)
     later = events.t_us >= cut * bit_us
-    decoder = Uart(8, "even", 1).decoder(1e6 / bit_us)
+    decoder = Uart(8, "even", 1).make_decoder(1e6 / bit_us)
     until_us = int(events.t_us[-1] + 3 * pause * bit_us)
     state, found = decoder.step(decoder.init(), events.t_us[later], events.p[later], until_us)
     state, more = decoder.close(state)
@@ -167,7 +167,7 @@ def test_a_stream_that_begins_within_a_character_gives_none_that_was_not_sent(cu
     right = zip(starts, sent.tolist(), strict=True)
     assert set(read) <= {(at + near, value) for at, value in right for near in (-1, 0, 1)}
     assert len(read) >= len(sent) - 3
-    assert state.given["characters"] == len(read)
+    assert state.tally["characters"] == len(read)
 
 
 def test_the_pause_tells_characters_of_a_recording_that_begins_within_a_packet():
@@ -230,7 +230,7 @@ def test_llrs_tell_the_truth():
 def test_the_best_path_is_the_best_of_all(seed, pause, after_pause):
     rng = np.random.default_rng(seed)
     scores, tails = rng.normal(4, 6, 14), rng.normal(0, 2, 14)
-    starts, worth = _kernels.best_path(scores, tails, 4, 0, 1, 5.0, 1.0, 0.5, pause, after_pause)
+    starts, score = _kernels.find_best_path(scores, tails, 4, 0, 1, 5.0, 1.0, 0.5, pause, after_pause)
 
     def cost(path):
         total = 0.0
@@ -250,7 +250,7 @@ def test_the_best_path_is_the_best_of_all(seed, pause, after_pause):
 
     every = [p for n in range(6) for p in itertools.combinations(range(14), n)]
     best = max(every, key=cost)
-    assert worth == pytest.approx(cost(best))
+    assert score == pytest.approx(cost(best))
     assert tuple(starts.tolist()) == best
 
 
@@ -366,11 +366,11 @@ def test_a_light_the_other_way_round_is_read(data_bits, parity, stop_bits, bit_h
     levels = levels_of(sent, data_bits, parity, stop_bits)
     assert Uart(data_bits, parity, stop_bits).codebook(1).codewords[sent].ravel().tolist() == levels
     events = light_of_bytes(rng, levels, bit_us, mark_on=mark_on, late_us=(40.0, 60.0), noise_hz=50.0)
-    decoder = Uart(data_bits, parity, stop_bits, idle=idle).decoder(bit_hz)
+    decoder = Uart(data_bits, parity, stop_bits, idle=idle).make_decoder(bit_hz)
     state, found = decoder.step(decoder.init(), events.t_us, events.p, int(events.t_us[-1]))
     state, more = decoder.close(state)
     assert [c.value for c in found + more] == sent.tolist()
-    assert state.given["frames_inverted"] == (len(sent) if (idle == "on") != mark_on else 0)
+    assert state.tally["frames_inverted"] == (len(sent) if (idle == "on") != mark_on else 0)
 
 
 @pytest.mark.parametrize("clock", [-0.025, 0.02])
@@ -438,7 +438,7 @@ def test_rate_and_format_of_a_light_are_found(data_bits, parity, stop_bits, bit_
     levels = levels_of(rng.integers(0, 1 << data_bits, 90), data_bits, parity, stop_bits)
     light = {"mark_on": mark_on, "noise_hz": bit_hz / 10, "start_us": 2e6} | light
     events = light_of_bytes(rng, levels, 1e6 / bit_hz / (1 + clock), **light)
-    found, _ = infer(events.t_us, events.p)
+    found, _ = infer_format(events.t_us, events.p)
     assert found.pop("air.chip_rate_hz") == pytest.approx(bit_hz * (1 + clock), rel=1e-3)
     assert found.pop("framing.first_bit") == "lowest"
     expected = {"data_bits": data_bits, "parity": parity, "stop_bits": stop_bits}
@@ -464,7 +464,7 @@ def light_of(kind):
 @pytest.mark.parametrize("kind", ["random bits", "pair codes", "a lamp", "PWM", "a pattern", "no light"])
 def test_other_light_is_no_asynchronous_one(kind):
     events = light_of(kind)
-    found, reported = infer(events.t_us, events.p)
+    found, reported = infer_format(events.t_us, events.p)
     assert found == {}
     assert reported.startswith("no asynchronous light found: at best ")
 

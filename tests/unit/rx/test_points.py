@@ -130,7 +130,7 @@ def simulated_errors(scene, sets, seed=None, lying=False):
     mine = [f for f in frames if np.isfinite(f.points_px).all() and lies(f.points_px) == lying]
     bars = [bar.strips[0].strip.cuts_m() for bar in simulation.bars]
     cuts = next(cuts for cuts in bars if lies(cuts) == lying)
-    at = simulation.path.at(np.array([f.points_t_us for f in mine]) - simulation.scene.t0_us)
+    at = simulation.path.sample(np.array([f.points_t_us for f in mine]) - simulation.scene.t0_us)
     want, _ = project((cuts[1:] + cuts[:-1]) / 2, *at, simulation.scene.camera)
     return np.array([f.points_px for f in mine]) - want
 

@@ -80,7 +80,7 @@ def test_the_light_on_each_pixel_is_that_of_the_lens(tmp_path: Path) -> None:
         pass
     light = simulation._state[:, _kernels.LIGHT].reshape(CAMERA.height, CAMERA.width)
     place, _ = project(
-        np.array([[-1.5, -0.48, 0.0], [-1.5, 0.48, 0.0]]), *simulation.path.at([2000.0]), CAMERA
+        np.array([[-1.5, -0.48, 0.0], [-1.5, 0.48, 0.0]]), *simulation.path.sample([2000.0]), CAMERA
     )
     (x, top), (_, bottom) = place[0]
     cluster_px, width_px = (bottom - top) / 16, 0.005 / 50 * CAMERA.focal_px

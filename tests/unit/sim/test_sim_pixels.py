@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.stats import binomtest, chisquare, kstest, norm
 
 from evlcp_sdk.sim import Scene, SensorSpec, _kernels
-from evlcp_sdk.sim.simulation import quantile_table, request_words, seed_key
+from evlcp_sdk.sim.simulation import pack_requests, seed_key, tabulate_quantiles
 from evlcp_sdk.values import Events
 from tests.models import pixels as model
 from tests.models.pixels import pixel_events, serve_requests, words_of
@@ -164,8 +164,8 @@ def test_a_pixel_is_blind_after_an_event_in_any_block() -> None:
     blind, kept = np.zeros(1024**2), []
     for begin in (0.0, 4000.0):
         within = (t >= begin) & (t < begin + 4000.0)
-        words = request_words(t[within], code[within], begin)
-        left = words[: _kernels.drop_blind(words, begin, blind, 1024, 30.0)]
+        words = pack_requests(t[within], code[within], begin)
+        left = words[: _kernels.drop_blind_requests(words, begin, blind, 1024, 30.0)]
         times = begin + (left >> _kernels.CODE_BITS) / _kernels.TICKS
         kept += np.stack([left & ((1 << _kernels.CODE_BITS) - 1), times], 1).tolist()
     last: dict[int, float] = {}
@@ -179,7 +179,7 @@ def test_a_pixel_is_blind_after_an_event_in_any_block() -> None:
 
 
 def test_random_numbers_are_those_of_a_normal_distribution() -> None:
-    table, draws = quantile_table(), [(k, d) for k in range(200) for d in range(50)]
+    table, draws = tabulate_quantiles(), [(k, d) for k in range(200) for d in range(50)]
     numbers, again = ([_kernels.hash_normal(seed_key(3), *one, 0, table) for one in draws] for _ in range(2))
     assert kstest(numbers, "norm").pvalue > 1e-3
     assert numbers == again

@@ -29,7 +29,7 @@ from evlcp_sdk.sim import (
     resolve_scene,
     truth_of,
 )
-from evlcp_sdk.sim.leds import led_light
+from evlcp_sdk.sim.leds import draw_led_light
 from evlcp_sdk.sim.light import BarLight, Source, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
 from evlcp_sdk.sim.scene import LensSpec
@@ -129,7 +129,7 @@ def test_leds_are_dead_stuck_dim_or_behind_slats() -> None:
     light, plain = (BarLight(one, resolve({}), LensSpec(), 7) for one in (bar, BarSpec(start_chip=2.3)))
     assert light.dark == {2}
     assert truth_of(Scene(bars=(bar,))).bars[0].covered == (2,)
-    own = led_light(bar, 96, 7)
+    own = draw_led_light(bar, 96, 7)
     assert np.log(own.sum(0)[own.sum(0) > 0]).std() == pytest.approx(0.3, abs=0.06)
     places_m = (np.arange(96)[:, None] + np.linspace(0, 1, 200, endpoint=False)) / 100
     for t_us in (1000.0, 1333.3, 2718.2, 4999.0):

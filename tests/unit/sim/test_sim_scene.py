@@ -21,7 +21,7 @@ from evlcp_sdk.sim import (
     resolve_scene,
     truth_of,
 )
-from evlcp_sdk.sim.light import BarLight, lamp_source
+from evlcp_sdk.sim.light import BarLight, make_lamp_source
 from evlcp_sdk.sim.motion import CameraPath, Vibration
 
 LINK = resolve({})
@@ -92,13 +92,13 @@ def test_a_bar_sends_what_the_air_interface_says() -> None:
 def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
     symbols = ((tuple(range(16)),) * 10,)
     light = BarLight(BarSpec(symbols=symbols, start_chip=0.0), LINK, LensSpec(), seed=0)
-    assert light.sent_symbols(0.05) == [[list(range(16))] * 10] * 2
+    assert light.list_symbols(0.05) == [[list(range(16))] * 10] * 2
     chips = np.random.default_rng(0).integers(0, 2, (50, 16))
     np.save(tmp_path / "chips.npy", chips)
     bar = BarSpec(chips_file=str(tmp_path / "chips.npy"), start_chip=40.0)
     sent = BarLight(bar, LINK, LensSpec(), seed=0)
     assert (sent.switches(0.0, 3000.0)[1] == np.concatenate([chips[40:], chips[:20]])).all()
-    assert sent.sent_symbols(1.0) == []
+    assert sent.list_symbols(1.0) == []
     texts = ["".join(map(str, row)) for row in np.tile(chips, (2, 1)).T]
     assert sent.longest_us == 100 * max(len(run) for text in texts for run in re.findall("0+|1+", text))
     (tmp_path / "text.npy").write_text("chips")
@@ -114,13 +114,13 @@ def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
 
 
 def test_lamps_keep_their_period_and_duty() -> None:
-    square = lamp_source(LampSpec(flicker_hz=1000.0, duty=0.3, depth=0.8, phase=0.5))
+    square = make_lamp_source(LampSpec(flicker_hz=1000.0, duty=0.3, depth=0.8, phase=0.5))
     when, levels = square.switches(0.0, 10_000.0)
     assert np.diff(when[::2]) == pytest.approx(1000)
     assert sorted({round(float(v), 9) for v in levels.ravel()}) == [0.2, 1.0]
     on = np.diff(np.concatenate([[0], when, [10_000]]))[levels[:, 0] == 1].sum()
     assert on == pytest.approx(3000, rel=0.1)
-    sine = lamp_source(LampSpec(flicker_hz=100.0, waveform="sine"))
+    sine = make_lamp_source(LampSpec(flicker_hz=100.0, waveform="sine"))
     when, levels = sine.switches(0.0, 10_000.0)
     assert len(when) == 31
     assert levels.max() > 0.99
@@ -134,7 +134,7 @@ def test_a_path_of_a_file_is_followed(tmp_path: Path) -> None:
     (tmp_path / "path.csv").write_text("\n".join(lines))
     (tmp_path / "scene.toml").write_text('[motion]\npath_file = "path.csv"\nvib_rate_rad_s = 0.0\n')
     scene = load_scene(tmp_path / "scene.toml", ["duration_s=0.2"])
-    position, attitude = CameraPath(scene.motion, 0.2, 0).at([1e5])
+    position, attitude = CameraPath(scene.motion, 0.2, 0).sample([1e5])
     assert position[0] == pytest.approx([0.3, 0.1, -39])
     assert np.degrees(attitude[0]) == pytest.approx([0.5, -0.2, 2])
     assert truth_of(scene).to_table()["distance_m"][0][100] == pytest.approx(39, abs=0.05)

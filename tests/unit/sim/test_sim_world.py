@@ -10,9 +10,9 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
-from evlcp_sdk.sim.leds import lit_strips
+from evlcp_sdk.sim.leds import split_into_strips
 from evlcp_sdk.sim.motion import CameraPath, project
-from evlcp_sdk.sim.world import attitude_log, scene_to_enu, surveyed_sites
+from evlcp_sdk.sim.world import attitude_log, scene_to_enu, survey_sites
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 137.2, "height_m": 40.0, "heading_deg": 30.0}
 MOTION = {"distance_m": 50.0, "yaw_deg": 2.0, "pitch_deg": -1.0, "roll_deg": 4.0}
@@ -44,7 +44,7 @@ def test_sites_and_camera_say_what_the_image_shows() -> None:
     for i in (0, 19):
         local = LocalAxes(*(path[key][i] for key in ("latitude_deg", "longitude_deg", "height_m")))
         axes = camera_axes(*(path[key][i] for key in ("heading_deg", "pitch_deg", "roll_deg")))
-        position, attitude = simulation.path.at(truth["t_s"][i] * 1e6)
+        position, attitude = simulation.path.sample(truth["t_s"][i] * 1e6)
         for site, light in zip(sites, simulation.bars, strict=True):
             seen = camera.project(site.cluster_positions_m(16, local) @ axes.T)
             strip = light.strips[0].strip
@@ -63,7 +63,7 @@ def test_clusters_that_are_not_in_line_stand_where_their_light_is(layout: dict[s
     scene = resolve_scene({"world": WORLD, "motion": {"distance_m": 50.0}, "bars": [bar]})
     (site,), (light,) = sites_of(scene), Simulation(scene).bars
     found = site.layout_positions_m(light.link.bar, LocalAxes(35.1, 137.2, 40.0))
-    for lit, strip in zip(lit_strips(light.bar, light.link.bar), light.strips, strict=True):
+    for lit, strip in zip(split_into_strips(light.bar, light.link.bar), light.strips, strict=True):
         cuts = strip.strip.cuts_m()
         for k, middle in zip(lit.clusters, (cuts[1:] + cuts[:-1]) / 2, strict=True):
             if k >= 0:
@@ -84,7 +84,7 @@ def test_an_imu_tells_the_attitude_and_one_error() -> None:
     for seed in range(60):
         path = CameraPath(scene.motion, scene.duration_s, seed)
         log = attitude_log(replace(scene, seed=seed), seed, path)
-        found, true = log.at(20_300.0), path.at(20_300.0)[1][0]
+        found, true = log.interpolate(20_300.0), path.sample(20_300.0)[1][0]
         assert found.heading_deg is not None
         heading = (found.heading_deg - 359.5 - np.degrees(true[0]) + 180) % 360 - 180
         errors.append([found.pitch_deg - np.degrees(true[1]), found.roll_deg - np.degrees(true[2]), heading])
@@ -102,18 +102,18 @@ def test_what_an_imu_does_not_know(known: str) -> None:
 
 
 def test_what_is_stated_of_sites_is_wrong_as_declared() -> None:
-    assert surveyed_sites(SCENE, 5) == sites_of(SCENE)
+    assert survey_sites(SCENE, 5) == sites_of(SCENE)
     one, two, three = SCENE.bars
     swapped = (replace(one, site_of=1), replace(two, site_of=0, site_off_m=(0.3, -0.4, 1.2)), three)
     wrong = replace(SCENE, bars=swapped)
-    true, reported = sites_of(wrong), surveyed_sites(wrong, 5)
+    true, reported = sites_of(wrong), survey_sites(wrong, 5)
     assert true == sites_of(SCENE)
     assert [s.transmitter_id for s in reported] == [1, 77, 3]
     assert replace(reported[0], transmitter_id=77) == true[1]
     assert reported[2] == true[2]
     np.testing.assert_allclose(off_m(reported[1], true[0]), [0.3, -0.4, 1.2], atol=1e-5)
     with pytest.raises(ConfigError, match=r"bars\.2\.site_of = 3: expected one of 3 bars"):
-        surveyed_sites(replace(wrong, bars=(one, two, replace(three, site_of=3))), 5)
+        survey_sites(replace(wrong, bars=(one, two, replace(three, site_of=3))), 5)
 
 
 def off_m(said: BarSite, true: BarSite) -> tuple[float, float, float]:
@@ -125,7 +125,7 @@ def off_m(said: BarSite, true: BarSite) -> tuple[float, float, float]:
 def test_a_survey_errs_by_what_it_says() -> None:
     assert SCENE.world is not None
     scene = replace(SCENE, world=replace(SCENE.world, survey_sigma_m=0.2))
-    surveys = [surveyed_sites(scene, seed) for seed in range(100)]
+    surveys = [survey_sites(scene, seed) for seed in range(100)]
     assert {site.position_sigma_m for survey in surveys for site in survey} == {0.2}
     errors = [off_m(*both) for survey in surveys for both in zip(survey, sites_of(scene), strict=True)]
     # 300 draws: the spread is known to 4 %.
@@ -148,6 +148,6 @@ def test_what_is_stated_of_the_attitude_is_wrong_as_declared() -> None:
     late = said(attitude_late_ms=10.0)
     np.testing.assert_allclose(late.pitch_deg[10:], right.pitch_deg[:-10])
     assert np.ptp(right.pitch_deg) > 0.01
-    true = np.degrees(simulation.path.at(right.t_us)[1][:, 1])
+    true = np.degrees(simulation.path.sample(right.t_us)[1][:, 1])
     np.testing.assert_allclose(said(attitude_errs=2.0).pitch_deg - true, 2 * (right.pitch_deg - true))
     assert set(said(attitude_errs=2.0).gravity_sigma_deg) == {0.1}
