@@ -124,7 +124,9 @@ def _laws() -> str:
     for head, laws in tables.items():
         parts.append(f"### {head}\n\n| law | meaning |\n|---|---|")
         parts[-1] += "".join(
-            f"\n| `{law.name}` | {law.says} |" for law in laws if head == "of form" or law.name not in shared
+            f"\n| `{law.name}` | {law.statement} |"
+            for law in laws
+            if head == "of form" or law.name not in shared
         )
     return "\n\n".join(parts)
 

@@ -140,7 +140,7 @@ def _check_one(
 
 def _law(outcome: Verdict) -> dict[str, str]:
     law = outcome.law
-    return {"law": law.name, "says": law.says, "status": outcome.status, "detail": outcome.detail}
+    return {"law": law.name, "says": law.statement, "status": outcome.status, "detail": outcome.detail}
 
 
 def _link(role: str, id: str, link_file: str | None, overrides: Sequence[str], registry: Registry) -> Link:
@@ -184,5 +184,5 @@ def _show(outcomes: Sequence[Verdict], width: int) -> None:
 
     out = console()
     for o in outcomes:
-        text = o.law.says if o.status == "ok" else " ".join(o.detail.split())
+        text = o.law.statement if o.status == "ok" else " ".join(o.detail.split())
         out.print(Text.assemble((f"{o.status:<7}", _STYLES[o.status]), f"  {o.law.name:<{width}}  {text}"))

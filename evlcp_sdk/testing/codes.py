@@ -12,17 +12,17 @@ from evlcp_sdk.testing.views import ideal_frame, ideal_presence, ideal_sums
 
 _COUNTS = (2, 4, 8, 16, 24, 32)
 _MOST_ALIKE = 0.25
-"""Correlation of two pilots, normalised: 3 of 8 values differ, so that one seen wrong is put right."""
+"""Most normalised correlation of two pilots: 3 of 8 values differ, so that one error is corrected."""
 _MOST_SIDELOBE = 0.25
 _MOST_EDGES_ALIKE = 0.6
-"""The same of the edges of codes that are no pair codes, and of their preamble with itself later on: pulses
-of two codes come at one time in half of the cases."""
+"""The same for the edges of other than pair codes, and for sidelobes of their preamble: pulses of two codes
+coincide in half of the cases."""
 _NEAR_CHIPS = 3
-"""How much later that is; nearer, chips that alternate are alike."""
+"""First shift of such a sidelobe: at smaller ones alternating chips are alike."""
 
 
-def _families(subject: Subject) -> list[NDArray[np.uint8]]:
-    """Codes for as many clusters as the family has them for."""
+def _make_codes(subject: Subject) -> list[NDArray[np.uint8]]:
+    """Make the family's codes for each number of clusters that it supports."""
     found = []
     for n in _COUNTS:
         try:
@@ -34,28 +34,28 @@ def _families(subject: Subject) -> list[NDArray[np.uint8]]:
     return found
 
 
-def _chips(code: NDArray[np.uint8], dimensions: int, name: str) -> None:
+def _expect_chips(code: NDArray[np.uint8], dimensions: int, name: str) -> None:
     expect(isinstance(code, np.ndarray) and code.dtype == np.uint8, f"{name} as a uint8 array")
     expect(code.ndim == dimensions and code.size, f"{name} with {dimensions} dimensions, got {code.shape}")
     expect(np.isin(code, (0, 1)).all(), f"{name} of chips 0 and 1 only")
 
 
-def _edges(code: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Those that tell codes apart: in the middle of pairs, else all."""
+def _select_edges(code: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Return the edges that distinguish codes: in the middle of pairs, or else all."""
     return edges_of_chips(code)[..., :: 2 if is_pair_code(code) else 1].astype(np.int64)
 
 
 @law("shapes", "uint8 chips, one code per cluster")
-def _pilots_shapes(subject: Subject) -> None:
-    _chips(subject.algorithm.preamble(), 1, "preamble()")
-    for codes in _families(subject):
-        _chips(codes, 2, f"codes({len(codes)})")
+def _check_pilot_shapes(subject: Subject) -> None:
+    _expect_chips(subject.algorithm.preamble(), 1, "preamble()")
+    for codes in _make_codes(subject):
+        _expect_chips(codes, 2, f"codes({len(codes)})")
 
 
 @law("pilots-apart", "of the edges of any two pilots, no more agree than of 8 values that differ in 3")
-def _pilots_apart(subject: Subject) -> None:
-    for codes in _families(subject):
-        edges = _edges(codes)
+def _check_pilot_correlation(subject: Subject) -> None:
+    for codes in _make_codes(subject):
+        edges = _select_edges(codes)
         many = np.maximum(np.sqrt((edges**2).sum(1)), 1e-9)
         alike = edges @ edges.T / np.outer(many, many)
         np.fill_diagonal(alike, -1)
@@ -69,30 +69,30 @@ def _pilots_apart(subject: Subject) -> None:
 
 
 @law("sharp-preamble", "the preamble's sidelobes are a quarter of its peak at the most")
-def _sharp_preamble(subject: Subject) -> None:
+def _check_preamble_sidelobes(subject: Subject) -> None:
     preamble = subject.algorithm.preamble()
-    code = _edges(preamble)
+    code = _select_edges(preamble)
     most, near = (_MOST_SIDELOBE, 1) if is_pair_code(preamble) else (_MOST_EDGES_ALIKE, _NEAR_CHIPS)
     side = np.abs(np.correlate(code, code, "full")[len(code) - 1 + near :]).max(initial=0) / (code**2).sum()
     expect(side <= most, f"sidelobes of the preamble of {most} at most, got {side:.2f}")
 
 
 @law("shapes", "uint8 chips, one codeword per symbol")
-def _codewords_shapes(subject: Subject) -> None:
+def _check_codeword_shapes(subject: Subject) -> None:
     words = subject.algorithm.codewords()
-    _chips(words, 2, "codewords()")
+    _expect_chips(words, 2, "codewords()")
     expect(len(words) >= 2, f"two codewords or more, got {len(words)}")
 
 
 @law("codewords-distinct", "the codewords of any two symbols differ in an edge")
-def _codewords_distinct(subject: Subject) -> None:
+def _check_codewords_differ(subject: Subject) -> None:
     words = subject.algorithm.codewords()
     distinct = len(np.unique(edges_of_chips(words), axis=0))
     expect(distinct == len(words), f"{len(words)} codewords of different edges, got {distinct}")
 
 
 @law("comes-back", "every symbol comes back from an ideal image of its codeword")
-def _codewords_come_back(subject: Subject) -> None:
+def _check_codewords_decode(subject: Subject) -> None:
     link = link_of(subject)
     book = link.codebook
     decode = link.algorithm("decoding").compile(book)
@@ -110,7 +110,7 @@ def _codewords_come_back(subject: Subject) -> None:
 
 
 @law("tells-apart", "the link's separation tells the clusters of an ideal image apart")
-def _default_clusters(subject: Subject) -> None:
+def _check_clusters_separate(subject: Subject) -> None:
     link = link_of(subject)
     book = link.codebook
     presence = link.algorithm("separation").compile(book)(
@@ -130,8 +130,8 @@ def _default_clusters(subject: Subject) -> None:
     expect(placed >= 0.9, f"nine tenths of the found cells in their place, got {placed:.0%}")
 
 
-PILOTS = (_pilots_shapes, _pilots_apart, _sharp_preamble, _default_clusters)
+PILOTS = (_check_pilot_shapes, _check_pilot_correlation, _check_preamble_sidelobes, _check_clusters_separate)
 """Laws of pilots."""
 
-MODULATION = (_codewords_shapes, _codewords_distinct, _codewords_come_back)
+MODULATION = (_check_codeword_shapes, _check_codewords_differ, _check_codewords_decode)
 """Laws of modulation."""

@@ -1,4 +1,4 @@
-"""What the laws hold an algorithm against: its link, what it compiles to, and one plain task a role."""
+"""What laws test an algorithm with: its link, what it compiles to, and one simple task a role."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ from evlcp_sdk.testing.views import ideal_frame, ideal_sums, ideal_view
 from evlcp_sdk.values import Events
 
 ONE_CLUSTER = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
-"""A bar for what sends with one cluster only."""
+"""A bar of one cluster."""
 
 FRAME_US = 3200.0
-"""Time from measurement to measurement of what tracks."""
+"""Time between the measurements of a tracking."""
 
 
 def subject_of(role: str, algorithm: Any, link: Link | None = None) -> Subject:
-    """An algorithm under test, under the id by which a configuration selects it, if any does."""
+    """Return the subject of an algorithm, with the id that selects it in a configuration, if there is one."""
     if link is not None and link.algorithms[role] == algorithm:
         return Subject(role, algorithm, link, link.table[role]["id"])
     target = f"{type(algorithm).__module__}:{type(algorithm).__qualname__}"
@@ -35,8 +35,8 @@ def subject_of(role: str, algorithm: Any, link: Link | None = None) -> Subject:
 
 
 @cache
-def link_of_one_cluster() -> Link:
-    """The default link, with a bar of one cluster."""
+def single_cluster_link() -> Link:
+    """Return the default link with a bar of one cluster."""
     return resolve({"bar": ONE_CLUSTER})
 
 
@@ -46,26 +46,27 @@ def _default_link() -> Link:
 
 
 def link_of(subject: Subject, **air: Any) -> Link:
-    """The link with the subject in its role; `air` overrides values of its table `[air]`.
+    """Return the link with the subject in its role; `air` overrides values of its table `[air]`.
 
-    Passes over a law where the subject has no code for the link's bar.
+    Raises:
+        InapplicableLawError: The subject has no code for the link's bar.
     """
     link = _default_link() if subject.link is None else subject.link
     if subject.role == "framing" and subject.link is None:
         try:
             subject.algorithm.codebook(link.bar.clusters)
         except ConfigError:
-            link = link_of_one_cluster()
+            link = single_cluster_link()
     if subject.role == "pilots":
         compile_or_skip(lambda: subject.algorithm.codes(link.bar.clusters))
     link = link.with_algorithm(subject.role, subject.algorithm, id=subject.id)
     if not link.codebook.is_pair_coded:
-        link = _of_chips(link, subject.role)
+        link = _set_chip_defaults(link, subject.role)
     return link.with_air(**air) if air else link
 
 
-def _of_chips(link: Link, kept: str) -> Link:
-    """The link with the defaults for codes of any chips where it has those for pair codes."""
+def _set_chip_defaults(link: Link, kept: str) -> Link:
+    """Replace the default algorithms for pair codes by those for codes of any chips."""
     registry = Registry.load()
     for name, role in ROLES.items():
         usual, other = role.default_for(link.bar), role.default_for(link.bar, link.codebook.unpaired_codes)
@@ -74,8 +75,8 @@ def _of_chips(link: Link, kept: str) -> Link:
     return link
 
 
-def expect_column(link: Link) -> None:
-    """Pass over a law whose ideal images show a bar, two clusters or more, one above the other, of others."""
+def require_column(link: Link) -> None:
+    """Raise an InapplicableLawError unless the bar is a column of two clusters or more."""
     if link.bar.clusters < 2 or np.ptp(link.bar.cluster_centres_m()[:, 0]) > 1e-9:
         raise InapplicableLawError("the ideal images of this law show one column of two clusters or more")
 
@@ -92,13 +93,13 @@ _ARGUMENTS: dict[str, Callable[[Link], tuple[Any, ...]]] = {
 }
 
 
-def arguments_of(subject: Subject) -> tuple[Any, ...]:
-    """What the subject's `compile` is given."""
+def compile_arguments(subject: Subject) -> tuple[Any, ...]:
+    """Return the arguments of the subject's `compile`."""
     return _ARGUMENTS[subject.role](link_of(subject))
 
 
-def compile_given(subject: Subject, arguments: tuple[Any, ...]) -> Any:
-    """What the subject's `compile` gives; passes over a law of what the receiver does by itself."""
+def compile_with(subject: Subject, arguments: tuple[Any, ...]) -> Any:
+    """Compile the subject; raise an InapplicableLawError if the receiver does its work itself."""
     rhythmic = subject.role == "detection" and subject.algorithm.rhythmic
     if rhythmic or (subject.role == "framing" and subject.algorithm.roles >= STEPS):
         raise InapplicableLawError("the receiver does this by itself")
@@ -106,32 +107,36 @@ def compile_given(subject: Subject, arguments: tuple[Any, ...]) -> Any:
 
 
 def compile_subject(subject: Subject) -> Any:
-    """What the subject compiles to on its link, if it does not refuse that; a role that does not, itself."""
+    """Compile the subject on its link if it accepts that; a role without `compile` returns itself."""
     if subject.role not in _ARGUMENTS:
         return subject.algorithm
-    arguments = arguments_of(subject)
-    return compile_or_skip(lambda: compile_given(subject, arguments))
+    arguments = compile_arguments(subject)
+    return compile_or_skip(lambda: compile_with(subject, arguments))
 
 
 def pilot_sums(link: Link, missing: float = 0.0, seed: int = 0) -> np.ndarray[Any, np.dtype[np.int16]]:
-    """Polarity sums of the pilot of an ideal frame, int16 (pilot chips, height, width)."""
+    """Return the polarity sums of the pilot of an ideal frame, int16 (pilot chips, height, width)."""
     sums = ideal_sums(link.codebook, symbols_of(link.codebook), missing=missing, seed=seed)
     return sums[: link.packet.pilot_chips]
 
 
 def symbols_of(codebook: Codebook, seed: int = 0) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Random symbols of one frame that carry bits, int64 (K,)."""
+    """Return random symbols of one frame that carry bits, int64 (K,)."""
     return np.random.default_rng(seed).integers(0, 2**codebook.bits_per_symbol, codebook.clusters)
 
 
-def recording_of(link: Link, packets: int, **how: Any) -> tuple[IdealBar, Events]:
-    """A bar that sends random symbols, and its events; `how` is of `ideal_events`."""
+def make_recording(link: Link, packets: int, **how: Any) -> tuple[IdealBar, Events]:
+    """Return a bar that sends random symbols, and its events; `how` has arguments of `ideal_events`."""
     bar = IdealBar(random_symbols(link, packets))
     return bar, ideal_events(link, bar, **how)
 
 
 def filters_of(subject: Subject) -> list[tuple[str, Any, int]]:
-    """The filters of a tracking algorithm, if it has any: (name, filter, values of a measurement)."""
+    """Return the filters of a tracking algorithm: (name, filter, values of a measurement).
+
+    Raises:
+        InapplicableLawError: It has none.
+    """
     tracker = compile_subject(subject)
     pairs = [("position", tracker.position, 2), ("distance", tracker.distance, 1)]
     found = [entry for entry in pairs if entry[1] is not None]
@@ -146,9 +151,9 @@ def feed_events(
     until_us: Sequence[int],
     keep: Callable[[Any, Events, int], Any] | None = None,
 ) -> list[Any]:
-    """What a framing's machine gives of a recording that is cut at times, and at its end.
+    """Feed a recording, cut at some times, to a framing, and close it; return its results.
 
-    `keep` may change its state before each step, by what is to come.
+    `keep` may change the state before each step.
     """
     state, found, begin = machine.init(), [], 0
     for until in until_us:
@@ -162,7 +167,7 @@ def feed_events(
 
 
 def run_filter(follow: Any, values: Any, peek: Callable[[Any, float], Any] | None = None) -> list[Any]:
-    """What a filter gives of measurements: (filtered, sigma); `peek` may change its state before each."""
+    """Return a filter's (filtered, sigma) of each measurement; `peek` may change the state before each."""
     state, out = follow.init(), []
     for i, value in enumerate(values):
         if peek is not None:
@@ -174,44 +179,44 @@ def run_filter(follow: Any, values: Any, peek: Callable[[Any, float], Any] | Non
 
 @dataclass(frozen=True)
 class Exercise:
-    """A task: values that hold arrays, and what compiles anew and gives a function from them to results."""
+    """A task: inputs with arrays, and what compiles the algorithm again to a function of them."""
 
     inputs: tuple[Any, ...]
     prepare: Callable[[], Callable[..., Any]]
 
 
-def exercise_of(subject: Subject) -> Exercise:
-    """The task of the subject's role, on its link."""
+def make_exercise(subject: Subject) -> Exercise:
+    """Make the task of the subject's role, on its link."""
     inputs, run = _EXERCISES[subject.role]
     return Exercise(inputs(subject), lambda: partial(run, compile_subject(subject)))
 
 
-def _events(packets: int) -> Callable[[Subject], tuple[Any, ...]]:
-    return lambda subject: (recording_of(link_of(subject), packets)[1],)
+def _draw_events(packets: int) -> Callable[[Subject], tuple[Any, ...]]:
+    return lambda subject: (make_recording(link_of(subject), packets)[1],)
 
 
-def _frame_image(subject: Subject) -> tuple[Any, ...]:
+def _make_frame(subject: Subject) -> tuple[Any, ...]:
     book = link_of(subject).codebook
-    # Clusters of which it is not known what follows, that it is dark, that it is lit.
+    # The chip after the frame is unknown, dark, or lit.
     return ideal_frame(book, symbols_of(book), after=np.arange(book.clusters) % 3 - 1, missing=0.1)
 
 
-def _view(subject: Subject) -> tuple[Any, ...]:
+def _make_view(subject: Subject) -> tuple[Any, ...]:
     book = link_of(subject).codebook
     return (ideal_view(book, symbols_of(book), missing=0.1),)
 
 
-def _measurements(subject: Subject) -> tuple[Any, ...]:
+def _draw_measurements(subject: Subject) -> tuple[Any, ...]:
     rng = np.random.default_rng(0)
     return tuple(rng.normal(50.0, 0.1, (20, n)) for _, _, n in filters_of(subject))
 
 
-def _filter(tracker: Any, *values: Any) -> Any:
+def _run_filters(tracker: Any, *values: Any) -> Any:
     filters = [follow for follow in (tracker.position, tracker.distance) if follow is not None]
     return [run_filter(follow, v) for follow, v in zip(filters, values, strict=True)]
 
 
-def _bits_and_llr(subject: Subject) -> tuple[Any, ...]:
+def _draw_block(subject: Subject) -> tuple[Any, ...]:
     code = compile_subject(subject)
     bits = np.random.default_rng(0).integers(0, 2, code.message_bits).astype(np.uint8)
     llr = (4 * (1 - 2 * code.encode(bits).astype(np.float32))).astype(np.float32)
@@ -224,18 +229,18 @@ def _call(function: Any, *inputs: Any) -> Any:
 
 
 _EXERCISES: dict[str, tuple[Callable[[Subject], tuple[Any, ...]], Callable[..., Any]]] = {
-    "detection": (_events(1), lambda detector, events: detector.step(detector.init(), 0, events)[1]),
-    "framing": (_events(2), lambda made, events: feed_events(made, events, [int(events.t_us[-1]) + 1])),
+    "detection": (_draw_events(1), lambda detector, events: detector.step(detector.init(), 0, events)[1]),
+    "framing": (_draw_events(2), lambda made, events: feed_events(made, events, [int(events.t_us[-1]) + 1])),
     "pilots": (lambda _: (), lambda pilots: (pilots.preamble(), pilots.codes(4))),
     "modulation": (lambda _: (), lambda modulation: modulation.codewords()),
     "synchronization": (
-        lambda subject: (_events(2)(subject)[0].t_us, _events(2)(subject)[0].p),
+        lambda subject: (_draw_events(2)(subject)[0].t_us, _draw_events(2)(subject)[0].p),
         lambda made, t_us, p: made.step(made.init(), t_us, p, int(t_us[-1]) + 1)[1],
     ),
     "separation": (lambda subject: (pilot_sums(link_of(subject), 0.1),), _call),
-    "decoding": (_frame_image, _call),
-    "ranging": (_view, _call),
-    "tracking": (_measurements, _filter),
-    "error-correction": (_bits_and_llr, lambda code, bits, llr: (code.encode(bits), code.decode(llr))),
+    "decoding": (_make_frame, _call),
+    "ranging": (_make_view, _call),
+    "tracking": (_draw_measurements, _run_filters),
+    "error-correction": (_draw_block, lambda code, bits, llr: (code.encode(bits), code.decode(llr))),
 }
-"""Role to its inputs, and what is done with them and what the algorithm compiles to."""
+"""Inputs by role, and the function of the compiled algorithm and these."""

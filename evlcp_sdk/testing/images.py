@@ -1,4 +1,4 @@
-"""Laws of what looks at images: separation, decoding, ranging."""
+"""Laws of algorithms on images: separation, decoding, ranging."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -10,7 +10,7 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Decode
-from evlcp_sdk.testing.exercises import compile_subject, expect_column, link_of, pilot_sums, symbols_of
+from evlcp_sdk.testing.exercises import compile_subject, link_of, pilot_sums, require_column, symbols_of
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compile_or_skip, expect, law
 from evlcp_sdk.testing.trees import map_arrays
 from evlcp_sdk.testing.views import GRID_PX, ideal_frame, ideal_presence, ideal_view
@@ -20,8 +20,8 @@ _SPACINGS_PX = (4, 6, 8, 10, 12, 14)
 """Spacings of clusters: 108 m to 31 m with the default bar and camera."""
 _EXACT = 1e-3
 _SEEDS = 3
-_FOLLOWED = ((-1, ""), (0, " before a dark chip"), (1, " before a lit chip"))
-"""What is known of the chip after a frame."""
+_NEXT_CHIPS = ((-1, ""), (0, " before a dark chip"), (1, " before a lit chip"))
+"""The chip after a frame, -1 if unknown, and its name."""
 
 
 def _expect_array(value: object, dtype: type, shape: tuple[int, ...], name: str) -> None:
@@ -32,14 +32,14 @@ def _expect_array(value: object, dtype: type, shape: tuple[int, ...], name: str)
         expect(False, f"{name} as {wanted} {shape}, got {value.dtype} {value.shape}")
 
 
-def _permuted(book: Codebook) -> tuple[NDArray[np.int64], Codebook]:
-    """Another order of the pilots, and the codebook with them in it."""
+def _permute_pilots(book: Codebook) -> tuple[NDArray[np.int64], Codebook]:
+    """Return another order of the pilots, and the codebook with this order."""
     order = np.random.default_rng(1).permutation(book.clusters)
     return order, Codebook(book.profile, book.preamble, book.pilots[order], book.codewords)
 
 
 @law("shapes", "a PresenceMap of the documented shapes and types, probabilities in range")
-def _separation_shapes(subject: Subject) -> None:
+def _check_separation_shapes(subject: Subject) -> None:
     link, separate = link_of(subject), compile_subject(subject)
     sums, k = pilot_sums(link, missing=0.2), link.codebook.clusters
     for given in (sums, sums[:, :-3, :-1]):
@@ -58,7 +58,7 @@ def _separation_shapes(subject: Subject) -> None:
 
 
 @law("finds-clusters", "each cluster of an ideal image is found in its place")
-def _finds_clusters(subject: Subject) -> None:
+def _check_clusters_found(subject: Subject) -> None:
     link, separate = link_of(subject), compile_subject(subject)
     shown = ideal_presence(link.codebook.clusters).pixels > 0
     for seed in range(_SEEDS):
@@ -73,7 +73,7 @@ def _finds_clusters(subject: Subject) -> None:
 
 
 @law("sees-nothing", "without events there is no cluster")
-def _separates_nothing(subject: Subject) -> None:
+def _check_empty_separation(subject: Subject) -> None:
     link, separate = link_of(subject), compile_subject(subject)
     found = separate(np.zeros((link.packet.pilot_chips, 40, 20), np.int16))
     expect(not found.selected.any(), f"no cell selected without events, got {found.selected.sum()}")
@@ -81,23 +81,33 @@ def _separates_nothing(subject: Subject) -> None:
 
 
 @law("permutes", "pilots in another order give the same maps in that order")
-def _separation_permutes(subject: Subject) -> None:
+def _check_separation_order(subject: Subject) -> None:
     link = link_of(subject)
-    order, book = _permuted(link.codebook)
+    order, book = _permute_pilots(link.codebook)
     sums = pilot_sums(link, missing=0.2)
-    plain = compile_subject(subject)(sums)
-    turned = compile_or_skip(lambda: subject.algorithm.compile(book))(sums)
+    direct = compile_subject(subject)(sums)
+    permuted = compile_or_skip(lambda: subject.algorithm.compile(book))(sums)
     for name in ("probability", "selected", "pixels"):
-        same = np.allclose(getattr(turned, name), getattr(plain, name)[order], atol=1e-5)
+        same = np.allclose(getattr(permuted, name), getattr(direct, name)[order], atol=1e-5)
         expect(same, f"{name} in another order, equal otherwise, when the pilots are in another order")
 
 
-SEPARATION = (_separation_shapes, _finds_clusters, _separates_nothing, _separation_permutes)
+SEPARATION = (
+    _check_separation_shapes,
+    _check_clusters_found,
+    _check_empty_separation,
+    _check_separation_order,
+)
 """Laws of separation."""
 
 
-def _decoders(subject: Subject) -> Iterator[tuple[Codebook, Decode]]:
-    """The subject compiled for the SDK's modulations and the link's that it takes, with the link's pilots."""
+def _compile_decoders(subject: Subject) -> Iterator[tuple[Codebook, Decode]]:
+    """Yield the codebooks of the SDK's modulations and the link's that the subject accepts, and it compiled
+    for each.
+
+    Raises:
+        InapplicableLawError: It accepts none.
+    """
     registry, link = Registry.load(), link_of(subject)
     books = []
     for entry in registry.list_algorithms("modulation"):
@@ -106,21 +116,21 @@ def _decoders(subject: Subject) -> Iterator[tuple[Codebook, Decode]]:
             books.append(link.with_algorithm("modulation", modulation, id=entry.algorithm.id).codebook)
     if link.codebook not in books:
         books.append(link.codebook)
-    taken = False
+    is_used = False
     for book in books:
         try:
             decode = subject.algorithm.compile(book)
         except ConfigError:
             continue
-        taken = True
+        is_used = True
         yield book, decode
-    if not taken:
+    if not is_used:
         raise InapplicableLawError("refuses every profile")
 
 
 @law("shapes", "SoftSymbols of the documented shapes and types, values in range")
-def _decoding_shapes(subject: Subject) -> None:
-    for book, decode in _decoders(subject):
+def _check_decoding_shapes(subject: Subject) -> None:
+    for book, decode in _compile_decoders(subject):
         soft = decode(*ideal_frame(book, symbols_of(book), missing=0.4))
         expect(isinstance(soft, SoftSymbols), f"SoftSymbols, got {type(soft).__name__}")
         _expect_array(soft.symbols, np.int64, (book.clusters,), "symbols")
@@ -134,12 +144,12 @@ def _decoding_shapes(subject: Subject) -> None:
 
 
 @law("inverts", "every symbol of every profile comes back from an ideal image")
-def _decoding_inverts(subject: Subject) -> None:
-    for book, decode in _decoders(subject):
+def _check_decoding(subject: Subject) -> None:
+    for book, decode in _compile_decoders(subject):
         n, k = book.data_symbols, book.clusters
         for first in range(0, n, k):
             symbols = (first + np.arange(k)) % n
-            for after, what in _FOLLOWED[:1] if book.is_pair_coded else _FOLLOWED:
+            for after, what in _NEXT_CHIPS[:1] if book.is_pair_coded else _NEXT_CHIPS:
                 got = decode(*ideal_frame(book, symbols, after=after)).symbols
                 for wrong in np.flatnonzero(got != symbols)[:1]:
                     first_wrong = f"symbol {symbols[wrong]}{what}, got {got[wrong]}"
@@ -147,8 +157,8 @@ def _decoding_inverts(subject: Subject) -> None:
 
 
 @law("llr-agrees", "the signs of the log-likelihood ratios spell the symbols that are given")
-def _llr_agrees(subject: Subject) -> None:
-    for book, decode in _decoders(subject):
+def _check_llr_signs(subject: Subject) -> None:
+    for book, decode in _compile_decoders(subject):
         m = book.bits_per_symbol
         for seed in range(_SEEDS):
             soft = decode(*ideal_frame(book, symbols_of(book, seed), missing=0.1, seed=seed))
@@ -161,21 +171,21 @@ def _llr_agrees(subject: Subject) -> None:
 
 
 @law("permutes", "clusters in another order say the same in that order")
-def _decoding_permutes(subject: Subject) -> None:
+def _check_decoding_order(subject: Subject) -> None:
     book = link_of(subject).codebook
-    order, other = _permuted(book)
+    order, other = _permute_pilots(book)
     after = np.arange(book.clusters) % 3 - 1
     presence, sums, *around = ideal_frame(book, symbols_of(book), after=after, missing=0.4)
-    plain = compile_subject(subject)(presence, sums, *around)
+    direct = compile_subject(subject)(presence, sums, *around)
     decode = compile_or_skip(lambda: subject.algorithm.compile(other))
-    turned = decode(map_arrays(presence, lambda a: a[order]), sums, *(sent[order] for sent in around))
-    expect((turned.symbols == plain.symbols[order]).all(), "symbols in the order of the clusters")
-    same = np.allclose(turned.llr, plain.llr[order], rtol=1e-3, atol=1e-3)
+    permuted = decode(map_arrays(presence, lambda a: a[order]), sums, *(sent[order] for sent in around))
+    expect((permuted.symbols == direct.symbols[order]).all(), "symbols in the order of the clusters")
+    same = np.allclose(permuted.llr, direct.llr[order], rtol=1e-3, atol=1e-3)
     expect(same, "llr in the order of the clusters")
 
 
 @law("knows-nothing", "without events the log-likelihood ratios are 0")
-def _decodes_nothing(subject: Subject) -> None:
+def _check_empty_decoding(subject: Subject) -> None:
     book = link_of(subject).codebook
     presence, sums, *around = ideal_frame(book, symbols_of(book))
     decode = compile_subject(subject)
@@ -186,16 +196,22 @@ def _decodes_nothing(subject: Subject) -> None:
         expect(np.isfinite(soft.quality), f"a finite quality from {what}, got {soft.quality}")
 
 
-DECODING = (_decoding_shapes, _decoding_inverts, _llr_agrees, _decoding_permutes, _decodes_nothing)
+DECODING = (
+    _check_decoding_shapes,
+    _check_decoding,
+    _check_llr_signs,
+    _check_decoding_order,
+    _check_empty_decoding,
+)
 """Laws of decoding."""
 
 
 def _measure(
     subject: Subject, cluster_px: int = 8, seed: int = 0, right_down: tuple[int, int] = (0, 0)
 ) -> Range:
-    """What the subject measures of an ideal image."""
+    """Return the range that the subject measures in an ideal image."""
     link = link_of(subject)
-    expect_column(link)
+    require_column(link)
     symbols = symbols_of(link.codebook, seed)
     view = ideal_view(link.codebook, symbols, cluster_px=cluster_px, offset_px=right_down)
     found: Range = compile_subject(subject)(view)
@@ -203,8 +219,7 @@ def _measure(
     return found
 
 
-def _expect_measuring(subject: Subject) -> None:
-    """Pass over a law of distances where the subject gives none."""
+def _skip_unless_measuring(subject: Subject) -> None:
     if not subject.algorithm.measures:
         raise InapplicableLawError("it measures nothing")
 
@@ -213,7 +228,7 @@ def _expect_measuring(subject: Subject) -> None:
     "shapes",
     "a Range of plain numbers, sigma from 0 on, or NaN for a single pair; NaN where nothing is measured",
 )
-def _range_shapes(subject: Subject) -> None:
+def _check_range_shapes(subject: Subject) -> None:
     found = _measure(subject)
     for name in ("distance_m", "sigma_m"):
         value = getattr(found, name)
@@ -223,16 +238,16 @@ def _range_shapes(subject: Subject) -> None:
         expect(nothing, f"NaN, NaN and 0 pairs of what measures nothing, got {found}")
         return
     expect(isinstance(found.pairs, int) and found.pairs > 0, f"pairs as a count above 0, got {found.pairs!r}")
-    # One pair has no spread: its sigma may be unknown.
+    # The sigma of a single pair may be unknown.
     known = found.sigma_m >= 0 or (found.pairs == 1 and np.isnan(found.sigma_m))
     expect(known, f"sigma_m from 0 on where there is a distance of several pairs, got {found.sigma_m}")
 
 
 @law("exact", "exact for clusters that lie whole pixels apart")
-def _exact(subject: Subject) -> None:
-    _expect_measuring(subject)
+def _check_exact(subject: Subject) -> None:
+    _skip_unless_measuring(subject)
     link = link_of(subject)
-    expect_column(link)
+    require_column(link)
     centres = link.bar.cluster_centres_m()
     for px in _SPACINGS_PX:
         true = link.camera.distance_m(float(np.hypot(*(centres[1] - centres[0]))), px)
@@ -243,8 +258,8 @@ def _exact(subject: Subject) -> None:
 
 
 @law("monotone", "the wider the image, the nearer")
-def _monotone(subject: Subject) -> None:
-    _expect_measuring(subject)
+def _check_monotone(subject: Subject) -> None:
+    _skip_unless_measuring(subject)
     found = [_measure(subject, px).distance_m for px in _SPACINGS_PX]
     got = ", ".join(f"{d:.2f}" for d in found)
     ends = f"{_SPACINGS_PX[0]} px to {_SPACINGS_PX[-1]} px"
@@ -252,8 +267,8 @@ def _monotone(subject: Subject) -> None:
 
 
 @law("moved", "the same wherever the bar stands in the image")
-def _stays_when_moved(subject: Subject) -> None:
-    _expect_measuring(subject)
+def _check_moved(subject: Subject) -> None:
+    _skip_unless_measuring(subject)
     still = _measure(subject).distance_m
     for moved in ((2 * GRID_PX, 0), (0, -2 * GRID_PX), (-GRID_PX, GRID_PX)):
         got = _measure(subject, right_down=moved).distance_m
@@ -262,8 +277,8 @@ def _stays_when_moved(subject: Subject) -> None:
 
 
 @law("focal-length", "in proportion to the focal length")
-def _scales_with_focal_length(subject: Subject) -> None:
-    _expect_measuring(subject)
+def _check_focal_length(subject: Subject) -> None:
+    _skip_unless_measuring(subject)
     near = _measure(subject).distance_m
     link = link_of(subject)
     camera = replace(link.camera, focal_mm=2 * link.camera.focal_mm)
@@ -274,9 +289,9 @@ def _scales_with_focal_length(subject: Subject) -> None:
 
 
 @law("sees-nothing", "no distance (NaN) from no cluster and from one")
-def _no_distance_of_nothing(subject: Subject) -> None:
+def _check_empty_ranging(subject: Subject) -> None:
     link = link_of(subject)
-    expect_column(link)
+    require_column(link)
     measure = compile_subject(subject)
     view = ideal_view(link.codebook, symbols_of(link.codebook))
     for clusters, what in ((0, "no cluster"), (1, "one cluster")):
@@ -289,7 +304,7 @@ def _no_distance_of_nothing(subject: Subject) -> None:
 
 
 RANGING = (
-    *(_range_shapes, _exact, _monotone, _stays_when_moved),
-    *(_scales_with_focal_length, _no_distance_of_nothing),
+    *(_check_range_shapes, _check_exact, _check_monotone, _check_moved),
+    *(_check_focal_length, _check_empty_ranging),
 )
 """Laws of ranging."""

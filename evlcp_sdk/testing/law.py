@@ -1,21 +1,21 @@
-"""What a law is, and how an algorithm is held against one."""
+"""Laws of algorithms, and how they are tested."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.testing.trees import difference
+from evlcp_sdk.testing.trees import find_difference
 
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
 
 Status = Literal["ok", "failed", "skipped", "excused"]
-"""`excused`: fails, as the author declared it would, with a reason."""
+"""`excused`: fails, as its author declared, with a reason."""
 
 
 class LawError(AssertionError):
-    """An algorithm breaks a law; the message says what was expected."""
+    """An algorithm breaks a law; the message has what was expected."""
 
 
 class InapplicableLawError(Exception):
@@ -27,10 +27,10 @@ class Subject:
     """An algorithm under test.
 
     Attributes:
-        role: The role that it fills.
+        role: Its role.
         algorithm: The algorithm, with the parameters to be tested.
-        link: What the rest of the link is; None for the default.
-        id: What messages call it; None for the name of its class.
+        link: The rest of the link; None for the default.
+        id: Its name in messages; None for the name of its class.
     """
 
     role: str
@@ -41,21 +41,21 @@ class Subject:
 
 @dataclass(frozen=True)
 class Law:
-    """What every algorithm of a role must do.
+    """A law that every algorithm of a role must keep.
 
     Attributes:
         name: Short name, unique within a role.
-        says: The law in one line.
-        test: Raises `LawError` where the subject breaks it, `InapplicableLawError` where it does not concern
-            the subject.
+        statement: The law in one line.
+        test: Raises `LawError` if a subject breaks it, `InapplicableLawError` if it does not concern the
+            subject.
     """
 
     name: str
-    says: str
+    statement: str
     test: Callable[[Subject], None]
 
-    def hold(self, subject: Subject) -> None:
-        """Hold a subject against the law.
+    def apply(self, subject: Subject) -> None:
+        """Test a subject.
 
         Raises:
             LawError: It breaks the law; any exception of the algorithm counts as that.
@@ -69,20 +69,20 @@ class Law:
             raise LawError(f"expected no exception, got {type(fault).__name__}: {fault}") from fault
 
 
-def law(name: str, says: str) -> Callable[[Callable[[Subject], None]], Law]:
-    """Make a test of a subject a law."""
-    return lambda test: Law(name, says, test)
+def law(name: str, statement: str) -> Callable[[Callable[[Subject], None]], Law]:
+    """Return the decorator that makes a test of a subject a law."""
+    return lambda test: Law(name, statement, test)
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a law was kept.
+    """The result of testing a law.
 
     Attributes:
         law: The law.
         status: Whether it was kept.
-        detail: What was expected and found, or why the law was passed over; empty if it was kept.
-        fault: How it was broken, with where that was in the algorithm; None otherwise.
+        detail: What was expected and found, or why the law was skipped; empty if it was kept.
+        fault: The error, with its place in the algorithm, if the law was broken.
     """
 
     law: Law
@@ -99,16 +99,16 @@ def expect(holds: object, what: str) -> None:
 
 def expect_same(got: Any, wanted: Any, what: str, tolerance: float = 0.0, name: str = "result") -> None:
     """Raise `LawError` with `what` was expected, and the first difference, unless two values are equal."""
-    differs = difference(got, wanted, tolerance, name)
+    differs = find_difference(got, wanted, tolerance, name)
     expect(differs is None, f"{what}; {differs}")
 
 
 def compile_or_skip(make: Callable[[], Any]) -> Any:
-    """What `make` compiles.
+    """Compile an algorithm by `make`.
 
     Raises:
-        InapplicableLawError: The algorithm refuses the test's bar or codes; that alone is for the law
-            `compiles` to judge.
+        InapplicableLawError: The algorithm refuses the test's bar or codes, which only the law `compiles`
+            tests.
     """
     try:
         return make()
@@ -116,11 +116,11 @@ def compile_or_skip(make: Callable[[], Any]) -> Any:
         raise InapplicableLawError(f"refused: {refused}") from refused
 
 
-def judge(law: Law, subject: Subject, excuses: Mapping[str, str]) -> Verdict:
-    """Hold a subject against a law; an excuse must be needed, or it is a failure itself."""
+def apply_law(law: Law, subject: Subject, excuses: Mapping[str, str]) -> Verdict:
+    """Test a subject by a law; an excuse that is not needed is a failure."""
     reason = excuses.get(law.name)
     try:
-        law.hold(subject)
+        law.apply(subject)
     except InapplicableLawError as why:
         if reason is not None:
             return Verdict(law, "failed", f"excused ({reason}), but the law does not apply: {why}")

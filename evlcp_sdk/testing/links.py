@@ -1,34 +1,34 @@
-"""The laws of the link: the whole receiver, with one algorithm exchanged, on a clean recording."""
+"""Laws of the link: the whole receiver with one algorithm replaced, on a clean recording."""
 
 import numpy as np
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.testing.exercises import expect_column, link_of
+from evlcp_sdk.testing.exercises import link_of, require_column
 from evlcp_sdk.testing.law import Subject, compile_or_skip, expect, law
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 
 _PACKETS = 3
 _CLUSTER_PX = 8.0
-_NEAR = 0.05
-"""Half a pixel of the image's edges in 8 px."""
+_TOLERANCE = 0.05
+"""Half a pixel of 8 px at the edges of the image."""
 
 _SPARSE = 4
-"""Frames from pilot to pilot, as in the fast profile."""
+"""Frames between pilots, as in the fast profile."""
 
 
 @law("clean-link", "no error in a clean recording with this algorithm in the link")
-def _clean(subject: Subject) -> None:
+def _check_clean(subject: Subject) -> None:
     _expect_clean(link_of(subject))
 
 
 @law("sparse-pilots", f"no error in a clean recording with the pilot in every {_SPARSE}th frame only")
-def _sparse(subject: Subject) -> None:
+def _check_sparse(subject: Subject) -> None:
     _expect_clean(link_of(subject, pilot_every=_SPARSE))
 
 
 def _expect_clean(link: Link) -> None:
-    expect_column(link)
+    require_column(link)
     bar = IdealBar(random_symbols(link, _PACKETS), cluster_px=_CLUSTER_PX)
     receiver = compile_or_skip(lambda: Receiver(link))
     packets = receiver.feed(ideal_events(link, bar, missing=0.0)) + receiver.close()
@@ -46,9 +46,9 @@ def _expect_clean(link: Link) -> None:
             continue
         for name, found in (("distance", frame.range), ("filtered", frame.filtered)):
             if found is not None:
-                what = f"{name} {true_m:.2f} m within {_NEAR:.0%}, got {found.distance_m:.2f} m"
-                expect(abs(found.distance_m / true_m - 1) <= _NEAR, what)
+                what = f"{name} {true_m:.2f} m within {_TOLERANCE:.0%}, got {found.distance_m:.2f} m"
+                expect(abs(found.distance_m / true_m - 1) <= _TOLERANCE, what)
 
 
-LINK = (_clean, _sparse)
+LINK = (_check_clean, _check_sparse)
 """The laws of the link, for every role."""

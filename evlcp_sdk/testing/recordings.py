@@ -12,10 +12,10 @@ from evlcp_sdk.values import Events
 
 @dataclass(frozen=True, eq=False)
 class IdealBar:
-    """A transmitter in the image that sends given symbols; its centre moves on a circle.
+    """A transmitter in the image that sends these symbols; its centre moves on a circle.
 
     Attributes:
-        symbols: What it sends, int64 (packets, frames, clusters).
+        symbols: Its symbols, int64 (packets, frames, clusters).
         x_px: Column of its centre, px.
         y_px: Row of its centre, px.
         cluster_px: Spacing of its clusters in the image, px.
@@ -37,13 +37,13 @@ class IdealBar:
     shake_hz: float = 10.0
 
     def centre(self, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Column and row of the centre, px."""
+        """Return the column and row of the centre at some times, px."""
         phase = 2 * np.pi * self.shake_hz * t_us * 1e-6
         return self.x_px + self.shake_px * np.sin(phase), self.y_px + self.shake_px * np.cos(phase)
 
 
 def random_symbols(link: Link, packets: int, seed: int = 0) -> NDArray[np.int64]:
-    """Random symbols of a link, of those that carry bits, int64 (packets, frames, clusters)."""
+    """Return random symbols of a link that carry bits, int64 (packets, frames, clusters)."""
     shape = (packets, link.packet.frames, link.codebook.clusters)
     return np.random.default_rng(seed).integers(0, link.codebook.data_symbols, shape)
 
@@ -59,12 +59,13 @@ def ideal_events(
     missing: float = 0.1,
     t0_us: int = 0,
 ) -> Events:
-    """What an ideal sensor sends: for each edge some events a pixel, late, jittered, some missing.
+    """Return the events of an ideal sensor: some of each pixel for each edge, delayed, jittered, some
+    missing.
 
     Args:
-        link: For codebook, packet format and the size of the sensor.
+        link: The link, with codebook, packet format and the size of the sensor.
         bar: The transmitter.
-        seed: Of jitter and missing events.
+        seed: Seed of jitter and missing events.
         events_per_edge: Events that a pixel sends for each edge.
         delay_on_us: From a rising edge to its first event, us.
         delay_off_us: From a falling edge to its first event, us.
@@ -73,7 +74,7 @@ def ideal_events(
     """
     rng = np.random.default_rng(seed)
     chips = np.concatenate([packet_chips(s, link.codebook, link.packet.pilot_every) for s in bar.symbols])
-    # It is dark before the first packet, and at rest after the last.
+    # The bar is dark before the first packet, and idle after the last.
     rest = link.algorithm("framing").rest() or 0
     edges = np.diff(chips.astype(np.int64), axis=0, prepend=0, append=rest)
     chip_us = link.packet.chip_us / (1 + bar.ppm * 1e-6)
@@ -86,10 +87,10 @@ def ideal_events(
     when, row, sign = (np.repeat(v, count) for v in (when, row, sign))
     column = np.tile(np.arange(count) % bar.width_px, len(when) // count)
     order = np.tile(np.arange(count) // bar.width_px, len(when) // count)
-    # What ends the last packet is drawn last: the same is seen of the packets, whatever follows them.
+    # The end of the last packet is drawn last, so that the packets do not depend on what follows them.
     many = int(np.count_nonzero(when < len(chips)))
-    drawn = [(rng.normal(0, 4, n), rng.random(n)) for n in (many, len(when) - many)]
-    jitter_us, chance = (np.concatenate(one) for one in zip(*drawn, strict=True))
+    draws = [(rng.normal(0, 4, n), rng.random(n)) for n in (many, len(when) - many)]
+    jitter_us, chance = (np.concatenate(one) for one in zip(*draws, strict=True))
     t = bar.start_us + when * chip_us
     t = t + np.where(sign > 0, delay_on_us, delay_off_us) + 12 * order + jitter_us
     x, y = bar.centre(t)
@@ -100,12 +101,12 @@ def ideal_events(
     t_us = np.floor(t[keep]).astype(np.int64) + t0_us
     first = np.argsort(t_us, kind="stable")
     seen = Events.of(t_us[first], u[keep][first], v[keep][first], (sign[keep] > 0)[first])
-    # A recording goes on for a while: its last event is noise in a corner.
+    # The recording goes on for a while: its last event is noise in a corner.
     end_us = bar.start_us + len(chips) * chip_us + t0_us
     return Events.concat([seen, Events.of([end_us + 1000], [0], [0], [1])])
 
 
-def merged(*parts: Events) -> Events:
-    """All events in order of time."""
+def merge_events(*parts: Events) -> Events:
+    """Return all events in order of time."""
     every = Events.concat(parts)
     return every[np.argsort(every.t_us, kind="stable")]

@@ -1,4 +1,4 @@
-"""Laws of what keeps state: detection, framing, synchronization, tracking."""
+"""Laws of algorithms with a state: detection, framing, synchronization, tracking."""
 
 import pickle
 from collections.abc import Callable
@@ -14,9 +14,9 @@ from evlcp_sdk.testing.exercises import (
     feed_events,
     filters_of,
     link_of,
-    link_of_one_cluster,
-    recording_of,
+    make_recording,
     run_filter,
+    single_cluster_link,
 )
 from evlcp_sdk.testing.law import Subject, expect, expect_same, law
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
@@ -26,20 +26,20 @@ _PACKETS = 4
 _STEP_US = 1500
 _FLUSH_US = 100_000
 _RATE_CHIPS = 0.02
-"""Error of the clock rate over a packet, in chips: a fiftieth moves no edge; 58 ppm of the default packet's
-346 chips. Of few pixels and short packets the events' own scatter leaves up to half of it."""
+"""Most error of the clock rate over a packet, chips: a fiftieth moves no edge, and is 58 ppm of the default
+packet's 346 chips. With few pixels and short packets the scatter of events leaves up to half of it."""
 _SAME = 1e-9
-"""Relative: 0.1 ns in the times of these recordings."""
-_NEAR_CHIPS = 0.75
+"""Relative tolerance: 0.1 ns in the times of these recordings."""
+_TOLERANCE_CHIPS = 0.75
 _MOST_BYTES = 1 << 22
-"""What a state may take, pickled, however long the stream is."""
-_GIVEN = {"framing": "frames", "synchronization": "locks", "detection": "regions"}
-"""What a role gives."""
+"""Most bytes of a pickled state, however long the stream is."""
+_RESULTS = {"framing": "frames", "synchronization": "locks", "detection": "regions"}
+"""Names of the results of a role."""
 
 
 @dataclass(frozen=True)
 class _Machine:
-    """A synchronizer, or a detector, in the shape of what a framing compiles to."""
+    """A synchronizer or a detector with the interface of a deframer."""
 
     init: Callable[[], Any]
     step: Callable[[Any, Events, int], Any]
@@ -51,8 +51,8 @@ class _Machine:
         return {}
 
 
-def _machine(subject: Subject) -> tuple[Link, Any]:
-    """The link, and what turns its events into frames or locks, or into the regions of each step."""
+def _compile_machine(subject: Subject) -> tuple[Link, Any]:
+    """Return the link, and the deframer of its events to frames, locks, or the regions of each step."""
     link, made = link_of(subject), compile_subject(subject)
     if subject.role == "synchronization":
         return link, _Machine(made.init, lambda s, events, until: made.step(s, events.t_us, events.p, until))
@@ -66,20 +66,20 @@ def _machine(subject: Subject) -> tuple[Link, Any]:
     return link, made
 
 
-def _recording(subject: Subject, link: Link) -> Events:
-    return recording_of(link, _PACKETS, missing=0.1 if subject.role == "synchronization" else 0.0)[1]
+def _make_recording(subject: Subject, link: Link) -> Events:
+    return make_recording(link, _PACKETS, missing=0.1 if subject.role == "synchronization" else 0.0)[1]
 
 
-def _steps(events: Events) -> list[int]:
+def _step_times(events: Events) -> list[int]:
     last = int(events.t_us[-1]) + 1
     end = -(-(last + _FLUSH_US) // _STEP_US) * _STEP_US
     return [*range(_STEP_US, last + _STEP_US, _STEP_US), end]
 
 
-def _any_split(subject: Subject) -> None:
-    link, machine = _machine(subject)
-    given, events = _GIVEN[subject.role], _recording(subject, link)
-    wanted = feed_events(machine, events, _steps(events))
+def _check_any_split(subject: Subject) -> None:
+    link, machine = _compile_machine(subject)
+    given, events = _RESULTS[subject.role], _make_recording(subject, link)
+    wanted = feed_events(machine, events, _step_times(events))
     last = int(events.t_us[-1]) + 1
     rng = np.random.default_rng(0)
     cuts = {
@@ -93,45 +93,45 @@ def _any_split(subject: Subject) -> None:
 
 
 @law("state-kept", "a step leaves the state it is given, which can be pickled")
-def _state_kept(subject: Subject) -> None:
-    link, machine = _machine(subject)
-    given, events = _GIVEN[subject.role], _recording(subject, link)
+def _check_state_kept(subject: Subject) -> None:
+    link, machine = _compile_machine(subject)
+    given, events = _RESULTS[subject.role], _make_recording(subject, link)
 
     def branch(state: Any, piece: Events, until_us: int) -> Any:
-        # A branch that is given up, and a state that was away.
+        # A branch that is given up, and a pickled state.
         then, _ = machine.step(state, piece, until_us)
         counts = machine.counts(then)
         expect(all(isinstance(n, int) for n in counts.values()), f"counts of whole numbers, got {counts}")
         return pickle.loads(pickle.dumps(state))
 
-    got, wanted = (feed_events(machine, events, _steps(events), keep) for keep in (branch, None))
+    got, wanted = (feed_events(machine, events, _step_times(events), keep) for keep in (branch, None))
     expect_same(got, wanted, f"branches and pickling not to change the state: the same {given}", name=given)
 
 
 @law("clean", "no error in the events of an ideal sensor, every frame in its place")
-def _reads_clean(subject: Subject) -> None:
-    link, deframer = _machine(subject)
-    bar, events = recording_of(link, _PACKETS, missing=0.0)
-    found = feed_events(deframer, events, _steps(events))
+def _check_clean(subject: Subject) -> None:
+    link, deframer = _compile_machine(subject)
+    bar, events = make_recording(link, _PACKETS, missing=0.0)
+    found = feed_events(deframer, events, _step_times(events))
     sent = bar.symbols.reshape(-1, link.codebook.clusters)
-    # The first packet begins with the recording: its first frame may be cut.
+    # The first packet starts with the recording, so that its first frame may be cut.
     expect(len(found) >= len(sent) - 1, f"{len(sent)} frames, or all but the first; got {len(found)}")
     starts = np.array([link.packet.frame_start_chip(frame) for frame in range(link.packet.frames)])
     for one in found:
         at = (one.t_us - bar.start_us) / link.packet.chip_us
-        packet, chip = divmod(at + _NEAR_CHIPS, link.packet.packet_chips)
-        chip -= _NEAR_CHIPS
+        packet, chip = divmod(at + _TOLERANCE_CHIPS, link.packet.packet_chips)
+        chip -= _TOLERANCE_CHIPS
         frame = int(np.abs(starts - chip).argmin())
         off = abs(chip - starts[frame])
-        expect(off <= _NEAR_CHIPS, f"frames where they were sent, got one {off:.2f} chips off")
+        expect(off <= _TOLERANCE_CHIPS, f"frames where they were sent, got one {off:.2f} chips off")
         expect(frame == one.frame, f"number {frame} of the frame at {one.t_us:.0f} us, got {one.frame}")
         wanted, got = bar.symbols[int(packet), frame].tolist(), one.soft.symbols.tolist()
         expect(got == wanted, f"symbols {wanted}, got {got}")
 
 
 @law("bounded", "a state of bounded size, however long the stream is")
-def _bounded(subject: Subject) -> None:
-    link, deframer = _machine(subject)
+def _check_bounded(subject: Subject) -> None:
+    link, deframer = _compile_machine(subject)
     rng = np.random.default_rng(0)
     state, now_us, n = deframer.init(), 0, 500
     step_us = max(_STEP_US, round(link.packet.packet_chips * link.packet.chip_us / 4))
@@ -146,22 +146,22 @@ def _bounded(subject: Subject) -> None:
 
 
 FRAMING = (
-    _reads_clean,
-    law("any-split", "any split of the events gives the same frames")(_any_split),
-    _state_kept,
-    _bounded,
+    _check_clean,
+    law("any-split", "any split of the events gives the same frames")(_check_any_split),
+    _check_state_kept,
+    _check_bounded,
 )
 """Laws of framing."""
 
 
 @law("shapes", "regions of finite places and sizes, each of another id; one where a bar is, or a light")
-def _regions_shapes(subject: Subject) -> None:
-    link, detector = _machine(subject)
-    events = _recording(subject, link)
-    found = feed_events(detector, events, _steps(events))
+def _check_region_shapes(subject: Subject) -> None:
+    link, detector = _compile_machine(subject)
+    events = _make_recording(subject, link)
+    found = feed_events(detector, events, _step_times(events))
     if subject.link is None and not any(found):
-        # One that looks for single lights sees none in a bar.
-        _regions_shapes.test(replace(subject, link=link_of_one_cluster()))
+        # A detector of single lights finds none in a bar.
+        _check_region_shapes.test(replace(subject, link=single_cluster_link()))
         return
     for regions in found:
         ids = [region.id for region in regions]
@@ -172,15 +172,15 @@ def _regions_shapes(subject: Subject) -> None:
     expect(any(found), "a region in a recording of a bar, or of one light; got none")
 
 
-DETECTION = (_regions_shapes, _state_kept)
+DETECTION = (_check_region_shapes, _check_state_kept)
 """Laws of detection."""
 
 
 @law("shapes", "locks of finite numbers, quality in range")
-def _locks_shapes(subject: Subject) -> None:
-    link, synchronizer = _machine(subject)
-    events = _recording(subject, link)
-    for lock in feed_events(synchronizer, events, _steps(events)):
+def _check_lock_shapes(subject: Subject) -> None:
+    link, synchronizer = _compile_machine(subject)
+    events = _make_recording(subject, link)
+    for lock in feed_events(synchronizer, events, _step_times(events)):
         expect(isinstance(lock, SyncLock), f"SyncLock, got {type(lock).__name__}")
         for name in ("packet_t_us", "chip_us", "delay_on_us", "delay_off_us", "quality"):
             value = getattr(lock, name)
@@ -189,13 +189,13 @@ def _locks_shapes(subject: Subject) -> None:
 
 
 @law("finds-time", "packets and clock rate of an ideal recording, one lock a packet")
-def _finds_time(subject: Subject) -> None:
-    link, synchronizer = _machine(subject)
+def _check_timing(subject: Subject) -> None:
+    link, synchronizer = _compile_machine(subject)
     for ppm, start_us in ((0.0, 5000.0), (60.0, 3333.0), (-60.0, 7777.0)):
         bar = IdealBar(random_symbols(link, _PACKETS), ppm=ppm, start_us=start_us)
         events = ideal_events(link, bar)
-        locks = feed_events(synchronizer, events, _steps(events))
-        # The first packet's beginning is the recording's: it may be found or not.
+        locks = feed_events(synchronizer, events, _step_times(events))
+        # The first packet starts with the recording, and may be found or not.
         expect(
             _PACKETS - 1 <= len(locks) <= _PACKETS,
             f"one lock a packet of {_PACKETS}, or all but the first; got {len(locks)}",
@@ -214,8 +214,8 @@ def _finds_time(subject: Subject) -> None:
 
 
 @law("no-lock-in-noise", "no lock in silence and in noise")
-def _no_lock_in_noise(subject: Subject) -> None:
-    _, synchronizer = _machine(subject)
+def _check_noise(subject: Subject) -> None:
+    _, synchronizer = _compile_machine(subject)
     for rate_hz in (0.0, 1e5, 2e6):
         rng = np.random.default_rng(int(rate_hz))
         n = int(rate_hz * 0.1)
@@ -226,37 +226,37 @@ def _no_lock_in_noise(subject: Subject) -> None:
 
 
 SYNCHRONIZATION = (
-    _locks_shapes,
-    _finds_time,
-    law("any-split", "any split of the events gives the same locks")(_any_split),
-    _state_kept,
-    _no_lock_in_noise,
+    _check_lock_shapes,
+    _check_timing,
+    law("any-split", "any split of the events gives the same locks")(_check_any_split),
+    _check_state_kept,
+    _check_noise,
 )
 """Laws of synchronization."""
 
 
-def _line(frames: int) -> Any:
-    """A straight line, float64 (frames, 1)."""
+def _make_line(frames: int) -> Any:
+    """Return a straight line, float64 (frames, 1)."""
     return (50.0 - 8.0 * np.arange(frames) * FRAME_US * 1e-6)[:, None]
 
 
-def _noisy_line(n: int, frames: int = 200) -> Any:
-    """The line with noise of 0.1, float64 (frames, n)."""
-    return _line(frames) + np.random.default_rng(0).normal(0, 0.1, (frames, n))
+def _make_noisy_line(n: int, frames: int = 200) -> Any:
+    """Return the line with noise of 0.1, float64 (frames, n)."""
+    return _make_line(frames) + np.random.default_rng(0).normal(0, 0.1, (frames, n))
 
 
 @law("shapes", "float64 values and a positive sigma; no prediction at first")
-def _filter_shapes(subject: Subject) -> None:
+def _check_filter_shapes(subject: Subject) -> None:
     for name, follow, n in filters_of(subject):
         state = follow.init()
         expect(follow.predict(state, 0.0) is None, f"{name}: a prediction of None before any measurement")
-        for i, value in enumerate(_noisy_line(n, 5)):
+        for i, value in enumerate(_make_noisy_line(n, 5)):
             given = value.copy()
             state, filtered, sigma = follow.step(state, i * FRAME_US, given, 0.1)
             expect((given == value).all(), f"{name}: the measurement to stay as it was")
-            ahead = follow.predict(state, (i + 1) * FRAME_US)
-            expect(ahead is not None, f"{name}: a prediction after a measurement")
-            for values, spread, what in ((filtered, sigma, "step"), (*ahead, "predict")):
+            predicted = follow.predict(state, (i + 1) * FRAME_US)
+            expect(predicted is not None, f"{name}: a prediction after a measurement")
+            for values, spread, what in ((filtered, sigma, "step"), (*predicted, "predict")):
                 expect(
                     isinstance(values, np.ndarray) and values.shape == (n,) and values.dtype == np.float64,
                     f"{name}: {what} to give float64 ({n},), got {values!r}",
@@ -268,8 +268,8 @@ def _filter_shapes(subject: Subject) -> None:
 
 
 @law("any-split", "predictions, branches and pickled states change nothing")
-def _looking_changes_nothing(subject: Subject) -> None:
-    def peeking(follow: Any, n: int) -> Callable[[Any, float], Any]:
+def _check_predictions_are_pure(subject: Subject) -> None:
+    def make_peek(follow: Any, n: int) -> Callable[[Any, float], Any]:
         def peek(state: Any, t_us: float) -> Any:
             follow.predict(state, t_us)
             follow.predict(state, t_us + 50_000)
@@ -280,18 +280,18 @@ def _looking_changes_nothing(subject: Subject) -> None:
         return peek
 
     for name, follow, n in filters_of(subject):
-        values = _noisy_line(n, 40)
-        got, wanted = run_filter(follow, values, peeking(follow, n)), run_filter(follow, values)
+        values = _make_noisy_line(n, 40)
+        got, wanted = run_filter(follow, values, make_peek(follow, n)), run_filter(follow, values)
         expect_same(got, wanted, "predictions, branches and pickling not to change what follows", name=name)
 
 
 @law("straight-line", "less error than measured on a straight line, none at rest")
-def _follows_a_line(subject: Subject) -> None:
+def _check_straight_line(subject: Subject) -> None:
     for name, follow, n in filters_of(subject):
-        values = _noisy_line(n)
+        values = _make_noisy_line(n)
         late = slice(len(values) // 2, None)
         filtered = np.array([f for f, _ in run_filter(follow, values)])
-        off = [(v - _line(len(values)))[late] for v in (values, filtered)]
+        off = [(v - _make_line(len(values)))[late] for v in (values, filtered)]
         raw, left = (float(np.sqrt((v**2).mean())) for v in off)
         expect(
             left <= raw * 1.001,
@@ -301,5 +301,5 @@ def _follows_a_line(subject: Subject) -> None:
         expect(np.allclose(end, 42.0, atol=1e-6), f"{name}: 42 from measurements of 42, got {end}")
 
 
-TRACKING = (_filter_shapes, _looking_changes_nothing, _follows_a_line)
+TRACKING = (_check_filter_shapes, _check_predictions_are_pure, _check_straight_line)
 """Laws of tracking."""

@@ -1,4 +1,4 @@
-"""All laws of a role; an algorithm held against them, by a call or as tests of pytest."""
+"""Test an algorithm by all laws of its role, by a call or as tests of pytest."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -12,27 +12,27 @@ from evlcp_sdk.testing.corrections import ERROR_CORRECTION
 from evlcp_sdk.testing.exercises import subject_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
 from evlcp_sdk.testing.images import DECODING, RANGING, SEPARATION
-from evlcp_sdk.testing.law import Law, LawError, Subject, Verdict, judge
+from evlcp_sdk.testing.law import Law, LawError, Subject, Verdict, apply_law
 from evlcp_sdk.testing.links import LINK
 from evlcp_sdk.testing.streams import DETECTION, FRAMING, SYNCHRONIZATION, TRACKING
 
-_EVERY = DESCRIPTION + FUNCTION + RESULT
+_FORM = DESCRIPTION + FUNCTION + RESULT
 _LAWS: dict[str, tuple[Law, ...]] = {
-    "detection": _EVERY + DETECTION,
-    "framing": _EVERY + FRAMING,
+    "detection": _FORM + DETECTION,
+    "framing": _FORM + FRAMING,
     "pilots": DESCRIPTION + RESULT + PILOTS + LINK,
     "modulation": DESCRIPTION + RESULT + MODULATION + LINK,
-    "synchronization": _EVERY + SYNCHRONIZATION + LINK,
-    "separation": _EVERY + SEPARATION + LINK,
-    "decoding": _EVERY + DECODING + LINK,
-    "ranging": _EVERY + RANGING + LINK,
-    "tracking": _EVERY + TRACKING + LINK,
-    "error-correction": _EVERY + ERROR_CORRECTION,
+    "synchronization": _FORM + SYNCHRONIZATION + LINK,
+    "separation": _FORM + SEPARATION + LINK,
+    "decoding": _FORM + DECODING + LINK,
+    "ranging": _FORM + RANGING + LINK,
+    "tracking": _FORM + TRACKING + LINK,
+    "error-correction": _FORM + ERROR_CORRECTION,
 }
 
 
 def laws_of(role: str) -> tuple[Law, ...]:
-    """The laws of a role, in order: description, function, result, the role's own, the link.
+    """Return the laws of a role, in order: description, function, result, the role's own, the link.
 
     Raises:
         ConfigError: There is no such role.
@@ -57,14 +57,14 @@ def _check_excuses(role: str, excuses: Mapping[str, str]) -> None:
 def check(
     role: str, algorithm: Any, excuses: Mapping[str, str] | None = None, link: Link | None = None
 ) -> list[Verdict]:
-    """Hold an algorithm against every law of its role.
+    """Test an algorithm by every law of its role.
 
     Args:
         role: A name of `evlcp_sdk.plugin.roles.ROLES`.
         algorithm: The algorithm, with the parameters to be tested.
-        excuses: Law to the reason why it is known to be broken. An excused law must be broken: if it holds,
-            or does not apply, that is a failure.
-        link: What the rest of the link is: bar, air, the algorithms of the other roles; None for the default.
+        excuses: Reasons of laws that are known to be broken, by law. An excused law that holds, or does not
+            apply, is a failure.
+        link: The rest of the link: bar, air, the algorithms of other roles; None for the default.
 
     Raises:
         ConfigError: There is no such role or law, or an excuse has no reason.
@@ -76,14 +76,14 @@ def check(
     excuses = excuses or {}
     _check_excuses(role, excuses)
     subject = subject_of(role, algorithm, link)
-    return [judge(law, subject, excuses) for law in laws_of(role)]
+    return [apply_law(law, subject, excuses) for law in laws_of(role)]
 
 
 def check_link(link: Link) -> Iterator[tuple[str, Verdict]]:
-    """Hold all algorithms of a link against the laws of their roles on it, and the link against its own.
+    """Test all algorithms of a link by the laws of their roles, and the link by its own.
 
     Yields:
-        The role, or `link`, and what became of one of its laws. Laws of the whole link come once, last.
+        The role, or `link`, and the verdict of one of its laws. Laws of the whole link come once, last.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> next(check_link(load_link()))[0]
@@ -93,24 +93,24 @@ def check_link(link: Link) -> Iterator[tuple[str, Verdict]]:
         subject = subject_of(role, link.algorithm(role), link)
         for law in laws_of(role):
             if law not in LINK:
-                yield role, judge(law, subject, {})
-    # A framing without the built-in steps has its own laws; they are those of the whole link.
+                yield role, apply_law(law, subject, {})
+    # The laws of a framing without the built-in steps are those of the whole link.
     if "decoding" in link.algorithms:
-        whole = subject_of("decoding", link.algorithm("decoding"), link)
+        subject = subject_of("decoding", link.algorithm("decoding"), link)
         for law in LINK:
-            yield "link", judge(law, whole, {})
+            yield "link", apply_law(law, subject, {})
 
 
 def conformance(
     role: str, *algorithms: Any, excuses: Mapping[str, str] | None = None, link: Link | None = None
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a test of pytest one test per law (and algorithm); its argument `check` holds the law.
+    """Make a test of pytest one test per law (and algorithm); its argument `check` tests the law.
 
     Args:
-        role: The role that the algorithms fill.
+        role: The role of the algorithms.
         algorithms: The algorithms, with the parameters to be tested.
-        excuses: Law to the reason why it is known to be broken: an expected failure, as of `check`.
-        link: What the rest of the link is; None for the default.
+        excuses: Reasons of laws that are known to be broken, by law: expected failures, as in `check`.
+        link: The rest of the link; None for the default.
 
     Raises:
         ConfigError: There is no such role or law, or an excuse has no reason.
@@ -130,16 +130,15 @@ def conformance(
         suffix = f"-{number}" if len(algorithms) > 1 else ""
         subject = subject_of(role, algorithm, link)
         for law in laws_of(role):
-            hold = partial(_hold, law, subject, excuses)
-            cases.append(pytest.param(hold, id=f"{type(algorithm).__name__}{suffix}-{law.name}"))
+            run_law = partial(_end_test, law, subject, excuses)
+            cases.append(pytest.param(run_law, id=f"{type(algorithm).__name__}{suffix}-{law.name}"))
     return pytest.mark.parametrize("check", cases)
 
 
-def _hold(law: Law, subject: Subject, excuses: Mapping[str, str]) -> None:
-    """End a test of pytest with a verdict."""
+def _end_test(law: Law, subject: Subject, excuses: Mapping[str, str]) -> None:
     import pytest
 
-    verdict = judge(law, subject, excuses)
+    verdict = apply_law(law, subject, excuses)
     if verdict.status == "failed":
         raise verdict.fault or LawError(verdict.detail)
     if verdict.status == "excused":

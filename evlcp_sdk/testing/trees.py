@@ -1,4 +1,4 @@
-"""Arrays within tuples, lists and frozen dataclasses: change, compare."""
+"""Change and compare arrays within tuples, lists and frozen dataclasses."""
 
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 def map_arrays(value: Any, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Any:
-    """The same structure with every array changed."""
+    """Return the same structure with every array changed."""
     if isinstance(value, np.ndarray):
         return change(value)
     if isinstance(value, tuple | list):
@@ -19,8 +19,8 @@ def map_arrays(value: Any, change: Callable[[NDArray[Any]], NDArray[Any]]) -> An
     return value
 
 
-def difference(got: Any, wanted: Any, tolerance: float = 0.0, name: str = "result") -> str | None:
-    """Where two values differ, None where they do not; NaN equals NaN."""
+def find_difference(got: Any, wanted: Any, tolerance: float = 0.0, name: str = "result") -> str | None:
+    """Describe the first difference of two values, None if there is none; NaN equals NaN."""
     if isinstance(wanted, np.ndarray):
         if not isinstance(got, np.ndarray):
             return f"{name}: {type(got).__name__}, not an array"
@@ -44,4 +44,4 @@ def difference(got: Any, wanted: Any, tolerance: float = 0.0, name: str = "resul
         return None if same else f"{name}: {got}, not {wanted}"
     else:
         return None if got == wanted else f"{name}: {got!r}, not {wanted!r}"
-    return next((d for g, w, n in parts if (d := difference(g, w, tolerance, n)) is not None), None)
+    return next((d for g, w, n in parts if (d := find_difference(g, w, tolerance, n)) is not None), None)

@@ -25,7 +25,7 @@ _STARTS = {
     b"SQLite format 3": "bag",
     b"\x89MCAP0\r\n": "bag",
     b"\x89HDF\r\n\x1a\n": "hdf5",
-    # In which HDF5 begins later.
+    # HDF5 starts later in the file.
     b"MATLAB 7.3": "hdf5",
     b"MATLAB 5.0": "mat",
 }
@@ -34,32 +34,32 @@ _SUFFIXES = {".aedat4": "faery", ".aedat": "faery", ".dat": "faery", ".es": "fae
 
 @hookimpl(trylast=True)
 def evlcp_open_events(url: str) -> "EventSource | None":
-    """Open a file of one of these formats, by its first bytes or its suffix; or as `bag:` and the like."""
+    """Open a file of one of these formats by its first bytes or its suffix, or by a scheme as `bag:`."""
     scheme, colon, rest = url.partition(":")
     if not colon or path_exists(url):
-        return _open(url, _format_of(url))
+        return _open_as(url, _detect_format(url))
     scheme = scheme.lower()
     if scheme in ("bag", "hdf5"):
-        return _open(f"{scheme}:{rest}", scheme)
+        return _open_as(f"{scheme}:{rest}", scheme)
     if scheme != "list":
         return None
     path = rest.rpartition("?")[0] or rest
-    found = _format_of(path)
+    found = _detect_format(path)
     if found == "hdf5":
         raise InputError(f"{path}: a file of MATLAB 7.3 or HDF5, expected to be named hdf5:{path}")
-    return _open(f"{scheme}:{rest}", found) if found == "mat" else None
+    return _open_as(f"{scheme}:{rest}", found) if found == "mat" else None
 
 
-def _open(url: str, found: str) -> "EventSource | None":
-    if not found:
+def _open_as(url: str, format: str) -> "EventSource | None":
+    if not format:
         return None
-    module, _, name = _OPENERS[found].partition(":")
+    module, _, name = _OPENERS[format].partition(":")
     opener: Callable[[str], EventSource] = getattr(import_module(module), name)
     return opener(url)
 
 
-def _format_of(name: str) -> str:
-    """The format of a file, by its suffix or its first bytes, or of a folder; empty for another."""
+def _detect_format(name: str) -> str:
+    """Return the format of a file by its suffix or its first bytes, or of a folder; empty for another."""
     path = Path(name)
     by_suffix = _SUFFIXES.get(path.suffix.lower(), "")
     if by_suffix == "faery":

@@ -9,37 +9,38 @@ from collections import OrderedDict
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
 from evlcp_sdk.errors import EvlcpError, InputError
 from evlcp_sdk.io.evt import EVT3
-from evlcp_sdk.io.raw import RawSource, format_header
+from evlcp_sdk.io.raw import ChunkReader, RawSource, format_header
 from evlcp_sdk.io.urls import split_options
 from evlcp_sdk.plugin.source import Loss
 
 TYPES: Final = ("event_camera_msgs/msg/EventPacket", "event_camera_msgs/EventPacket")
 
-_MOST_HELD: Final = 256
-"""Packets that wait for earlier ones: some seconds of a camera, 30 MB."""
+_MOST_WAITING: Final = 256
+"""Packets that may wait for earlier ones: some seconds of a camera, 30 MB."""
 
 _STEPS: Final = 1_000_000
 _STEPS_A_BYTE: Final = 4
 _STEPS_AT_ONCE: Final = 10_000
-"""Steps that SQLite may take, and those between two looks; a row of a message takes twenty."""
+"""Steps that SQLite may take, in all, per byte and between checks; a row of a message takes twenty."""
 
 _MAGICS: Final = {b"#ROSBAG V2.0": "ROS 1", b"SQLite format 3": "SQLite", b"\x89MCAP0\r\n": "MCAP"}
 
 
 @dataclass(frozen=True)
 class EventPacket:
-    """What of a message matters: its sensor, its number, its words.
+    """A message with events.
 
     Attributes:
         width: Columns of the sensor.
-        height: Its rows.
-        seq: Number of the packet, which tells of lost ones.
-        encoding: Of its words, `evt3`.
+        height: Rows of the sensor.
+        seq: Number of the packet, by which lost ones are found.
+        encoding: Encoding of the words, `evt3`.
         data: The words.
     """
 
@@ -54,7 +55,8 @@ def open_bag(url: str) -> "BagSource":
     """Open `bag:PATH`, or `bag:PATH?topic=NAME`: a file of any kind, or a folder of ROS 2.
 
     Raises:
-        InputError: It is no bag, has no such topic, or other words than EVT3; or the extra `ros` is needed.
+        InputError: It is not a bag, has no such topic, or other words than EVT3; or the extra `ros` is
+            needed.
     """
     named, options = split_options(url, {"topic": str}) if url.startswith("bag:") else (url, {})
     path = named.removeprefix("bag:")
@@ -68,33 +70,32 @@ def open_bag(url: str) -> "BagSource":
 
 
 class BagSource(RawSource):
-    """The events of a bag's topic, its packets decoded one after another as one stream of words.
+    """Reads the events of a bag's topic, its packets as one stream of words.
 
-    Packets are taken by their numbers, as far as they are in disorder by no more than a few hundred; those
-    that are there twice are left out, and counted (`packets_twice`), and missing ones are the loss
-    `packets_lost`.
+    Packets that are out of order by up to a few hundred are sorted by their numbers; repeated ones are left
+    out and counted (`packets_twice`), and missing ones are the loss `packets_lost`.
 
     Args:
         path: The bag.
-        topic: Which; None for the only one.
+        topic: The topic; None for the only one.
     """
 
     def __init__(self, path: Path | str, topic: str | None = None) -> None:
         target = Path(path)
         self._stack = ExitStack()
         try:
-            self._order = _Order(_messages(target, topic, self._stack))
-            self._packets = _BagBytes(target, iter(self._order))
+            self._order = _PacketOrder(_read_bag(target, topic, self._stack))
+            self._packets = _PacketReader(target, iter(self._order))
             super().__init__(target, file=self._packets)
         except BaseException:
             self._stack.close()
             raise
         self.format = "BAG"
-        self.size_bytes = sum(file.stat().st_size for file in _files_of(target))
+        self.size_bytes = sum(file.stat().st_size for file in _list_files(target))
 
     @property
     def losses(self) -> dict[str, Loss]:
-        """As `EventSource.losses`, with the packets that are missing."""
+        """As `EventSource.losses`, with missing packets."""
         lost, first = self._packets.lost, self._packets.first_lost
         if not lost:
             return super().losses
@@ -102,7 +103,7 @@ class BagSource(RawSource):
 
     @property
     def counts(self) -> dict[str, int]:
-        """As `EventSource.counts`, with packets that were there twice, or not in their order."""
+        """As `EventSource.counts`, with packets that are repeated, or out of order."""
         found = {"packets_twice": self._order.twice, "packets_out_of_order": self._order.out_of_order}
         return super().counts | {name: count for name, count in found.items() if count}
 
@@ -112,87 +113,87 @@ class BagSource(RawSource):
         self._stack.close()
 
 
-class _Order:
-    """Packets by their numbers, each once; a number far below begins anew, as a driver does.
+class _PacketOrder:
+    """Sorts packets by their numbers, each once; a number far below starts anew, as a driver does.
 
     Args:
-        packets: As the bag gives them.
+        packets: The packets in the order of the bag.
 
     Attributes:
-        twice: How many were left out.
-        out_of_order: How many came after a later one.
+        twice: Number of repeated packets, which are left out.
+        out_of_order: Number of packets after a later one.
     """
 
     def __init__(self, packets: Iterable[EventPacket]) -> None:
         self._packets = packets
-        self._held: dict[int, EventPacket] = {}
-        self._given: OrderedDict[int, int] = OrderedDict()
+        self._waiting: dict[int, EventPacket] = {}
+        self._past: OrderedDict[int, int] = OrderedDict()
         self.twice = self.out_of_order = 0
 
     def __iter__(self) -> Iterator[EventPacket]:
         latest = -1
         for packet in self._packets:
-            digest, same = zlib.crc32(packet.data), self._held.get(packet.seq)
-            if self._given.get(packet.seq) == digest or (same is not None and same.data == packet.data):
+            digest, same = zlib.crc32(packet.data), self._waiting.get(packet.seq)
+            if self._past.get(packet.seq) == digest or (same is not None and same.data == packet.data):
                 self.twice += 1
                 continue
-            self.out_of_order += packet.seq < latest <= packet.seq + _MOST_HELD
+            self.out_of_order += packet.seq < latest <= packet.seq + _MOST_WAITING
             latest = packet.seq
-            while packet.seq in self._held or len(self._held) >= _MOST_HELD:
+            while packet.seq in self._waiting or len(self._waiting) >= _MOST_WAITING:
                 yield self._pop()
-            self._held[packet.seq] = packet
-        while self._held:
+            self._waiting[packet.seq] = packet
+        while self._waiting:
             yield self._pop()
 
     def _pop(self) -> EventPacket:
-        """The one that goes on where the last one ended, or else the first."""
-        expected = next(reversed(self._given), -1) + 1
-        near = [seq for seq in self._held if expected <= seq <= expected + _MOST_HELD] if self._given else []
-        packet = self._held.pop(min(near or self._held))
-        self._given[packet.seq] = zlib.crc32(packet.data)
-        self._given.move_to_end(packet.seq)
-        if len(self._given) > _MOST_HELD:
-            self._given.popitem(last=False)
+        """Take out the packet that follows the last one, or else the first."""
+        expected = next(reversed(self._past), -1) + 1
+        near = (
+            [seq for seq in self._waiting if expected <= seq <= expected + _MOST_WAITING]
+            if self._past
+            else []
+        )
+        packet = self._waiting.pop(min(near or self._waiting))
+        self._past[packet.seq] = zlib.crc32(packet.data)
+        self._past.move_to_end(packet.seq)
+        if len(self._past) > _MOST_WAITING:
+            self._past.popitem(last=False)
         return packet
 
 
-class _BagBytes:
-    """The words of a bag's packets, as `RawSource` reads them, behind a header of their sensor."""
+class _PacketReader(ChunkReader):
+    """The words of a bag's packets, behind a header of their sensor.
+
+    Attributes:
+        lost: Number of missing packets.
+        first_lost: Byte at which the first is missing.
+    """
 
     def __init__(self, path: Path, packets: Iterator[EventPacket]) -> None:
         self._path = path
-        self._iterator = packets
         self._next_seq: int | None = None
-        self._bytes = 0
         self.lost = self.first_lost = 0
         first = next(packets, None)
         if first is None:
             raise InputError(f"{path}: no packets on its topic")
-        self._encoding_of(first)
-        self._ready = memoryview(format_header(EVT3, first.width, first.height))
-        self._waiting: EventPacket | None = first
+        self._packets: Iterator[EventPacket] = chain([first], packets)
+        self._check_encoding(first)
+        super().__init__(format_header(EVT3, first.width, first.height))
 
-    def readinto(self, room: memoryview, /) -> int:
-        """Give bytes; 0 at the end."""
-        while not len(self._ready):
-            packet = self._waiting or next(self._iterator, None)
-            self._waiting = None
-            if packet is None:
-                return 0
-            self._encoding_of(packet)
+    def read_chunk(self) -> memoryview:
+        """Return the words of the next packet; none at the end."""
+        for packet in self._packets:
+            self._check_encoding(packet)
             if self._next_seq is not None and packet.seq > self._next_seq:
                 if not self.lost:
-                    self.first_lost = self._bytes
+                    self.first_lost = self.bytes_read
                 self.lost += packet.seq - self._next_seq
             self._next_seq = packet.seq + 1
-            self._ready = packet.data
-        size = min(len(room), len(self._ready))
-        room[:size] = self._ready[:size]
-        self._ready = self._ready[size:]
-        self._bytes += size
-        return size
+            if len(packet.data):
+                return packet.data
+        return memoryview(b"")
 
-    def _encoding_of(self, packet: EventPacket) -> None:
+    def _check_encoding(self, packet: EventPacket) -> None:
         if packet.encoding != "evt3":
             raise InputError(
                 f"{self._path}: packets of encoding {packet.encoding!r}, expected 'evt3', as"
@@ -200,13 +201,12 @@ class _BagBytes:
             )
 
     def close(self) -> None:
-        """Give no more."""
-        self._iterator, self._waiting = iter(()), None
-        self._ready = memoryview(b"")
+        """Stop reading."""
+        self._packets, self._ready = iter(()), memoryview(b"")
 
 
-def _files_of(path: Path) -> list[Path]:
-    """The files of a bag: itself, or those of its folder as metadata.yaml or their numbers order them."""
+def _list_files(path: Path) -> list[Path]:
+    """List the files of a bag: itself, or those of its folder by metadata.yaml or by their numbers."""
     if not path.is_dir():
         return [path]
     try:
@@ -227,11 +227,11 @@ def _files_of(path: Path) -> list[Path]:
     )
 
 
-def _messages(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    """The packets of a bag, file by file."""
+def _read_bag(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+    """Return the packets of a bag, file by file."""
     if not path.exists():
         raise InputError(f"{path}: No such file or directory")
-    files = _files_of(path)
+    files = _list_files(path)
     if not files:
         raise InputError(f"{path}: a folder without .db3 or .mcap files, expected a bag")
     parts = []
@@ -243,29 +243,28 @@ def _messages(path: Path, topic: str | None, stack: ExitStack) -> Iterator[Event
             raise InputError(
                 f"{file}: starts with {start[:8].hex(' ')}, expected a bag of ROS 1, SQLite or MCAP"
             )
-        parts.append(_read(file, kind, topic, stack))
+        parts.append(_read_file(file, kind, topic, stack))
     return (packet for part in parts for packet in part)
 
 
-def _chosen(path: Path, topics: dict[str, str], topic: str | None) -> str:
-    """The topic to read, of those with their types."""
+def _choose_topic(path: Path, topics: dict[str, str], topic: str | None) -> str:
+    """Choose the topic to read by the types of topics."""
     fitting = [name for name, kind in topics.items() if kind in TYPES]
-    listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none"
+    names = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none"
     if topic is not None:
         if topic not in fitting:
-            raise InputError(f"{path}: topic {topic!r}, expected one of type EventPacket (topics: {listed})")
+            raise InputError(f"{path}: topic {topic!r}, expected one of type EventPacket (topics: {names})")
         return topic
     if len(fitting) != 1:
         what = "no topic" if not fitting else f"{len(fitting)} topics"
         hint = "" if not fitting else "; choose one by ?topic=NAME"
-        raise InputError(f"{path}: {what} of type event_camera_msgs/EventPacket (topics: {listed}){hint}")
+        raise InputError(f"{path}: {what} of type event_camera_msgs/EventPacket (topics: {names}){hint}")
     return fitting[0]
 
 
-def _read(path: Path, kind: str, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    """The packets of a file."""
+def _read_file(path: Path, kind: str, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
     try:
-        yield from {"ROS 1": _ros1, "SQLite": _sqlite, "MCAP": _mcap}[kind](path, topic, stack)
+        yield from {"ROS 1": _read_ros1, "SQLite": _read_sqlite, "MCAP": _read_mcap}[kind](path, topic, stack)
     except InputError:
         raise
     except Exception as fault:
@@ -273,81 +272,81 @@ def _read(path: Path, kind: str, topic: str | None, stack: ExitStack) -> Iterato
         raise InputError(f"{path}: {type(fault).__name__}: {fault}") from fault
 
 
-def _sqlite(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    # A live run reads in a thread of its own, what it opens in another.
+def _read_sqlite(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+    # A live run opens in one thread and reads in another.
     base = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
     stack.enter_context(closing(base))
-    _limit(base, path)
+    _limit_sqlite(base, path)
     rows = base.execute("SELECT name, id, type FROM topics").fetchall()
     number = {name: number for name, number, _ in rows}
-    chosen = _chosen(path, {name: kind for name, _, kind in rows}, topic)
+    chosen = _choose_topic(path, {name: kind for name, _, kind in rows}, topic)
     found = base.execute("SELECT data FROM messages WHERE topic_id = ? ORDER BY rowid", (number[chosen],))
     for (data,) in found:
         if not isinstance(data, bytes):
             raise InputError(f"{path}: a message of type {type(data).__name__}, expected bytes")
-        yield _of_cdr(path, data)
+        yield _parse_cdr(path, data)
 
 
-def _limit(base: sqlite3.Connection, path: Path) -> None:
-    """Let a file take no more room and time than one of its size may, and have tables where a bag has them.
+def _limit_sqlite(base: sqlite3.Connection, path: Path) -> None:
+    """Limit the room and time of a database by its size, and check that it has the tables of a bag.
 
     Raises:
-        InputError: Something else is there under these names.
+        InputError: It has something else by these names.
     """
     size = path.stat().st_size
     base.text_factory = lambda text: text.decode("utf-8", "replace")
     base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(size, 1 << 16))
-    left = [_STEPS + size * _STEPS_A_BYTE]
+    remaining = [_STEPS + size * _STEPS_A_BYTE]
 
     def count_down() -> bool:
-        left[0] -= _STEPS_AT_ONCE
-        return left[0] < 0
+        remaining[0] -= _STEPS_AT_ONCE
+        return remaining[0] < 0
 
     base.set_progress_handler(count_down, _STEPS_AT_ONCE)
     base.execute("PRAGMA trusted_schema = OFF")
     found = dict(base.execute("SELECT name, type || coalesce(sql, '') FROM sqlite_master"))
     for name in ("topics", "messages"):
-        made = " ".join(str(found.get(name, "nothing")).upper().split())
-        if not made.startswith("TABLECREATE TABLE"):
+        definition = " ".join(str(found.get(name, "nothing")).upper().split())
+        if not definition.startswith("TABLECREATE TABLE"):
             raise InputError(f"{path}: found no table '{name}', expected a bag of ROS 2")
 
 
-def _mcap(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    made = _needed(path, "mcap.reader").make_reader(stack.enter_context(path.open("rb")))
-    summary = made.get_summary()
+def _read_mcap(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+    reader = _import_extra(path, "mcap.reader").make_reader(stack.enter_context(path.open("rb")))
+    summary = reader.get_summary()
     schemas = summary.schemas if summary is not None else {}
     channels = summary.channels.values() if summary is not None else ()
     topics = {one.topic: schemas[one.schema_id].name for one in channels if one.schema_id in schemas}
-    for _, _, message in made.iter_messages([_chosen(path, topics, topic)], log_time_order=False):
-        yield _of_cdr(path, message.data)
+    for _, _, message in reader.iter_messages([_choose_topic(path, topics, topic)], log_time_order=False):
+        yield _parse_cdr(path, message.data)
 
 
-def _ros1(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    made = stack.enter_context(_needed(path, "rosbags.rosbag1").Reader(path))
-    chosen = _chosen(path, {one.topic: one.msgtype for one in made.connections}, topic)
-    for _, _, data in made.messages([one for one in made.connections if one.topic == chosen]):
-        yield _of_ros1(path, data)
+def _read_ros1(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+    reader = stack.enter_context(_import_extra(path, "rosbags.rosbag1").Reader(path))
+    chosen = _choose_topic(path, {one.topic: one.msgtype for one in reader.connections}, topic)
+    for _, _, data in reader.messages([one for one in reader.connections if one.topic == chosen]):
+        yield _parse_ros1(path, data)
 
 
-def _needed(path: Path, module: str) -> Any:
+def _import_extra(path: Path, module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as fault:
         raise InputError(f"{path}: needs the extra: pip install 'evlcp-sdk[ros]'") from fault
 
 
-def _of_cdr(path: Path, data: bytes) -> EventPacket:
-    """A message of ROS 2: fields at multiples of their size, behind four bytes that say the byte order."""
-    return _unpacked(path, data[4:], "<" if data[1:2] == b"\x01" else ">", "iIsIIQQsBs", aligned=True)
+def _parse_cdr(path: Path, data: bytes) -> EventPacket:
+    """Parse a message of ROS 2: aligned fields after four bytes with the byte order."""
+    return _parse_packet(path, data[4:], "<" if data[1:2] == b"\x01" else ">", "iIsIIQQsBs", aligned=True)
 
 
-def _of_ros1(path: Path, data: bytes) -> EventPacket:
-    """A message of ROS 1: fields stand one behind another, and a header has a number of its own."""
-    return _unpacked(path, data, "<", "IIIsIIQQsBs", aligned=False)
+def _parse_ros1(path: Path, data: bytes) -> EventPacket:
+    """Parse a message of ROS 1: fields without padding, and a header with a number of its own."""
+    return _parse_packet(path, data, "<", "IIIsIIQQsBs", aligned=False)
 
 
-def _unpacked(path: Path, data: bytes, order: str, codes: str, *, aligned: bool) -> EventPacket:
-    """A packet of its fields, as `struct` names them; `s` is a number of bytes, and these."""
+def _parse_packet(path: Path, data: bytes, order: str, codes: str, *, aligned: bool) -> EventPacket:
+    """Parse the fields of a packet by their codes of `struct`; `s` is a number of bytes, and these."""
     fields: list[Any] = []
     at = 0
     try:

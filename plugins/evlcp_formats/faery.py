@@ -1,4 +1,4 @@
-"""AEDAT4, DAT and Event Stream files, through the optional package `faery`."""
+"""Read AEDAT4, DAT and Event Stream files by the optional package `faery`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,18 +17,18 @@ _FORMATS: Final = {
     ".dat": ("DAT", "dat"),
     ".es": ("ES", "es"),
 }
-"""Name of a format, and what `faery` calls it, by suffix."""
+"""Name of a format, and its name in `faery`, by suffix."""
 
 UNKNOWN_SIZE = (0xFFFF, 0xFFFF)
 
 
 class FaerySource(EventSource):
-    """A file that `faery` reads; contrast-detection events only, no triggers.
+    """Reads a file by `faery`; contrast-detection events only, no triggers.
 
-    What `faery` skips without a word, such as the rest of a DAT file cut within an event, is in no loss.
+    What `faery` skips silently, such as the rest of a DAT file cut within an event, is in no loss.
 
     Args:
-        path: The file; its suffix decides the format.
+        path: The file; its suffix is the format.
 
     Raises:
         InputError: `faery` is not installed, or cannot read the file.
@@ -57,7 +57,7 @@ class FaerySource(EventSource):
         self._row = 1
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """The next packet of the file, of whatever size it has, or None at the end."""
+        """Return the next packet of the file, of any size, or None at the end."""
         try:
             packet = next(self._packets, None)
         except Exception as error:

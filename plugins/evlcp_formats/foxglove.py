@@ -1,4 +1,4 @@
-"""`fixes.mcap`: what a run finds as MCAP with well-known schemas, as it comes."""
+"""`fixes.mcap`: the results of a run as MCAP with well-known schemas, as they come."""
 
 import json
 import math
@@ -27,7 +27,7 @@ FRAME_ID, CAMERA_ID = "enu", "camera"
 """Names of the local axes, and of the camera's: x right, y down, z forward."""
 
 _PICTURE_US, _WINDOW_US = 40_000, 10_000
-"""From one picture to the next, and how much time each shows."""
+"""Time from one picture to the next, and time that each shows."""
 
 _WHITE, _AMBER = (1.0, 1.0, 1.0, 0.8), (1.0, 0.75, 0.2, 1.0)
 
@@ -58,7 +58,7 @@ class Mcap(Sink):
         self._bars: dict[int, BarSite] = {}
 
     def events(self, events: Events) -> None:
-        """Draw them, and write the pictures that are complete."""
+        """Draw events, and write complete pictures."""
         number, phase_us = np.divmod(events.t_us, _PICTURE_US)
         shown = phase_us >= _PICTURE_US - _WINDOW_US
         number, events = number[shown], events[shown]
@@ -72,7 +72,7 @@ class Mcap(Sink):
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
-        """Keep the regions, and write those of a picture's time together."""
+        """Collect the regions, and write those in the time of a picture together."""
         if stage != "regions":
             return
         turn = int(value.t_us // _PICTURE_US)
@@ -82,45 +82,45 @@ class Mcap(Sink):
         self._regions[value.id] = value
 
     def packet(self, packet: Packet) -> None:
-        """Write its frames."""
+        """Write the frames of a packet."""
         for frame in packet.frames:
             self._write_json("/frames", frame.t_us, format_frame(frame))
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
-        """Write a fix that is given, and the filtered place at its time."""
+        """Write a fix, and the filtered place at its time if it is accepted."""
         from scipy.spatial.transform import Rotation
 
-        self._integrity(fix)
-        self._scene(fix.t_us)
+        self._write_integrity(fix)
+        self._write_scene(fix.t_us)
         if filtered is None:
             return
         measured = (fix.latitude_deg, fix.longitude_deg, fix.height_m)
         place = (filtered.latitude_deg, filtered.longitude_deg, filtered.height_m)
-        self._location("/fix", fix.t_us, measured, fix.covariance_m2)
-        self._location("/track", fix.t_us, place, filtered.covariance_m2)
+        self._write_location("/fix", fix.t_us, measured, fix.covariance_m2)
+        self._write_location("/track", fix.t_us, place, filtered.covariance_m2)
         if not math.isfinite(fix.heading_deg):
             return
         axes = Attitude(fix.pitch_deg, fix.roll_deg, fix.heading_deg).rotation()
         turn = Rotation.from_matrix(axes).as_quat()
-        pose = _schema("PoseInFrame")(frame_id=FRAME_ID)
-        pose.timestamp.FromNanoseconds(self._at_ns(fix.t_us))
+        pose = _load_schema("PoseInFrame")(frame_id=FRAME_ID)
+        pose.timestamp.FromNanoseconds(self._to_ns(fix.t_us))
         where, how = pose.pose.position, pose.pose.orientation
         where.x, where.y, where.z = fix.enu_m.tolist()
         how.x, how.y, how.z, how.w = turn.tolist()
-        self._write("/pose", fix.t_us, pose)
+        self._write_message("/pose", fix.t_us, pose)
 
     def finish(self) -> Mapping[str, Any]:
-        """Write what waits, and the file's index."""
+        """Write the last picture and regions, and the file's index."""
         self._write_picture()
         self._write_regions()
         self._writer.finish()
         return {}
 
-    def _location(
+    def _write_location(
         self, topic: str, t_us: float, place: tuple[float, float, float], covariance_m2: NDArray[np.float64]
     ) -> None:
         latitude, longitude, height = place
-        fix = _schema("LocationFix")
+        fix = _load_schema("LocationFix")
         message = fix(
             frame_id=FRAME_ID,
             latitude=latitude,
@@ -129,23 +129,23 @@ class Mcap(Sink):
             position_covariance=covariance_m2.ravel().tolist(),
             position_covariance_type=fix.KNOWN,
         )
-        message.timestamp.FromNanoseconds(self._at_ns(t_us))
-        self._write(topic, t_us, message)
+        message.timestamp.FromNanoseconds(self._to_ns(t_us))
+        self._write_message(topic, t_us, message)
 
-    def _integrity(self, fix: Fix) -> None:
+    def _write_integrity(self, fix: Fix) -> None:
         from google.protobuf.struct_pb2 import Struct
 
         message = Struct()
         message.update({"bars": list(fix.transmitters), "refusal": fix.refusal} | integrity_fields(fix))
-        self._write("/integrity", fix.t_us, message)
+        self._write_message("/integrity", fix.t_us, message)
 
     def _write_picture(self) -> None:
         if self._picture is None:
             return
         end_us = (self._picture + 1) * _PICTURE_US
-        image = _schema("CompressedImage")(frame_id=CAMERA_ID, data=self._image.to_png(), format="png")
-        image.timestamp.FromNanoseconds(self._at_ns(end_us))
-        self._write("/image", end_us, image)
+        image = _load_schema("CompressedImage")(frame_id=CAMERA_ID, data=self._image.to_png(), format="png")
+        image.timestamp.FromNanoseconds(self._to_ns(end_us))
+        self._write_message("/image", end_us, image)
         self._image.clear()
         self._picture = None
 
@@ -153,32 +153,32 @@ class Mcap(Sink):
         if self._turn is None:
             return
         end_us = (self._turn + 1) * _PICTURE_US
-        message, loop = _schema("ImageAnnotations")(), _schema("PointsAnnotation").LINE_LOOP
+        message, loop = _load_schema("ImageAnnotations")(), _load_schema("PointsAnnotation").LINE_LOOP
         for region in self._regions.values():
             box = message.points.add(type=loop, thickness=1)
-            box.timestamp.FromNanoseconds(self._at_ns(end_us))
+            box.timestamp.FromNanoseconds(self._to_ns(end_us))
             box.outline_color.r, box.outline_color.g, box.outline_color.b, box.outline_color.a = _WHITE
             for right, down in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
                 box.points.add(
                     x=region.x_px + right * (region.width_px / 2 + 2),
                     y=region.y_px + down * (region.height_px / 2 + 2),
                 )
-        self._write("/regions", end_us, message)
+        self._write_message("/regions", end_us, message)
         self._regions.clear()
         self._turn = None
 
-    def _scene(self, t_us: float) -> None:
-        """Write the bars whose places have become known, or changed."""
+    def _write_scene(self, t_us: float) -> None:
+        """Write the bars if the place of one has become known or changed."""
         assert self.run.navigator is not None
         positioner = self.run.navigator.positioner
         axes, bars = positioner.axes, dict(positioner.bars.known_sites)
         if axes is None or bars == self._bars:
             return
-        message = _schema("SceneUpdate")()
+        message = _load_schema("SceneUpdate")()
         for number, site in bars.items():
             bar = message.entities.add(frame_id=FRAME_ID, id=f"bar {number}", frame_locked=True)
-            bar.timestamp.FromNanoseconds(self._at_ns(t_us))
-            line = bar.lines.add(type=_schema("LinePrimitive").LINE_STRIP, thickness=0.05)
+            bar.timestamp.FromNanoseconds(self._to_ns(t_us))
+            line = bar.lines.add(type=_load_schema("LinePrimitive").LINE_STRIP, thickness=0.05)
             line.pose.orientation.w = 1
             line.color.r, line.color.g, line.color.b, line.color.a = _AMBER
             middle = axes.to_enu(site.latitude_deg, site.longitude_deg, site.height_m)
@@ -190,31 +190,30 @@ class Mcap(Sink):
             text.color.r, text.color.g, text.color.b, text.color.a = _AMBER
             text.pose.orientation.w = 1
             text.pose.position.x, text.pose.position.y, text.pose.position.z = middle.tolist()
-        self._write("/scene", t_us, message)
+        self._write_message("/scene", t_us, message)
         self._bars = bars
 
-    def _write(self, topic: str, t_us: float, message: Any) -> None:
+    def _write_message(self, topic: str, t_us: float, message: Any) -> None:
         from mcap_protobuf.schema import register_schema
 
         if topic not in self._channels:
             schema = register_schema(self._writer, type(message))
             self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema)
-        self._add(topic, t_us, message.SerializeToString())
+        self._add_message(topic, t_us, message.SerializeToString())
 
     def _write_json(self, topic: str, t_us: float, text: str) -> None:
         if topic not in self._channels:
             schema = self._writer.register_schema("evlcp.Frame", "jsonschema", json.dumps(_FRAME).encode())
             self._channels[topic] = self._writer.register_channel(topic, "json", schema)
-        self._add(topic, t_us, text.encode())
+        self._add_message(topic, t_us, text.encode())
 
-    def _add(self, topic: str, t_us: float, data: bytes) -> None:
-        log_ns = self._at_ns(t_us)
+    def _add_message(self, topic: str, t_us: float, data: bytes) -> None:
+        log_ns = self._to_ns(t_us)
         self._writer.add_message(self._channels[topic], log_time=log_ns, data=data, publish_time=log_ns)
 
-    def _at_ns(self, t_us: float) -> int:
+    def _to_ns(self, t_us: float) -> int:
         return to_utc_ns(self.run.clock_zero, t_us)
 
 
-def _schema(name: str) -> Any:
-    """The type of a message."""
+def _load_schema(name: str) -> Any:
     return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)

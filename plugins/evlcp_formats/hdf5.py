@@ -1,4 +1,4 @@
-"""HDF5 files, those of MATLAB 7.3 among them: columns in a group, records, or a table without names."""
+"""Read HDF5 files, also of MATLAB 7.3: columns in a group, records, or a table without names."""
 
 import copy
 import math
@@ -22,10 +22,10 @@ _ECF: Final = 36559
 """Number of the filter of Prophesee's codec, which no package with a permissive licence reads."""
 
 _MOST_CHUNK_BYTES: Final = 1 << 26
-"""Of what is unpacked at once; libraries choose a thousandth of it."""
+"""Most bytes of a chunk, which is unpacked at once; libraries choose a thousandth of it."""
 
 _MOST_RATIO: Final = 1100
-"""How much a byte of a file can hold: the limit of deflate is 1032."""
+"""Most unpacked bytes per byte of a file: the limit of deflate is 1032."""
 
 
 def open_hdf5(url: str) -> ColumnSource:
@@ -37,29 +37,31 @@ def open_hdf5(url: str) -> ColumnSource:
     """
     name, options = url, dict[str, Any]()
     if url.startswith("hdf5:"):
-        name, options = split_options(url, {"columns": _order, "unit": parse_unit, "swapped": parse_flag})
+        name, options = split_options(
+            url, {"columns": _parse_order, "unit": parse_unit, "swapped": parse_flag}
+        )
         name = name.removeprefix("hdf5:")
 
-    def opened(path: Path, stack: ExitStack) -> EventTable:
-        return _read(path, stack, options.get("columns"), options.get("swapped", False))
+    def read_table(path: Path, stack: ExitStack) -> EventTable:
+        return _read_file(path, stack, options.get("columns"), options.get("swapped", False))
 
-    return ColumnSource(name, opened, unit=options.get("unit"))
+    return ColumnSource(name, read_table, unit=options.get("unit"))
 
 
-def _order(text: str) -> Fields:
+def _parse_order(text: str) -> Fields:
     if sorted(text) != sorted("txyp"):
         raise ValueError("the letters t, x, y and p in the order of the table's columns, such as txyp")
     return Fields(text.index("t"), text.index("p"), (text.index("x"), text.index("y")))
 
 
-def _read(path: Path, stack: ExitStack, order: Fields | None, swapped: bool) -> EventTable:
-    """Records or a group of columns by `h5py`, under one of `_PLACES`, or the only ones.
+def _read_file(path: Path, stack: ExitStack, order: Fields | None, swapped: bool) -> EventTable:
+    """Read records or a group of columns under one of `_PLACES`, or the only ones in the file.
 
     External storage, links to other files and virtual data sets are refused.
     """
     try:
         file = stack.enter_context(h5py.File(path, "r"))
-        columns, found = _columns_of(path, file, order)
+        columns, found = _find_columns(path, file, order)
         size = [file.attrs.get(name) for name in ("width", "height")]
         width, height = (int(side) if side is not None else None for side in size)
     except InputError:
@@ -76,10 +78,10 @@ def _read(path: Path, stack: ExitStack, order: Fields | None, swapped: bool) -> 
 
 
 class _DataSet:
-    """A data set, upright where it lies on its side, as those of MATLAB do."""
+    """A data set, transposed if it lies on its side, as those of MATLAB do."""
 
     def __init__(self, path: Path, dataset: Any) -> None:
-        _check(path, dataset)
+        _check_dataset(path, dataset)
         self._path, self._dataset = path, dataset
         self.dtype: np.dtype[Any] = dataset.dtype
         shape = dataset.shape
@@ -87,31 +89,31 @@ class _DataSet:
         shape = shape[::-1] if self._on_its_side else shape
         self.shape = shape[:1] if shape[1:] == (1,) else shape
         self._part: Any = (slice(None), 0) if len(shape) > len(self.shape) else ...
-        self._held: list[Any] = [None, None]
+        self._block: list[Any] = [None, None]
 
     def __getitem__(self, key: Any, /) -> Any:
-        """The values of some rows, read once for all columns; or a column."""
+        """Return some rows, read once for all columns; or a column."""
         if not isinstance(key, slice):
             column = copy.copy(self)
             column._part, column.shape = key, self.shape[:1]
             column.dtype = self.dtype[key] if isinstance(key, str) else self.dtype
             return column
-        if self._held[0] != key:
+        if self._block[0] != key:
             try:
                 block = np.asarray(self._dataset[:, key].T if self._on_its_side else self._dataset[key])
             except Exception as fault:
                 raise InputError(
                     f"{self._path}: row {(key.start or 0) + 1}: damaged: {format_error(fault)}"
                 ) from fault
-            self._held[:] = key, block
-        return self._held[1][self._part]
+            self._block[:] = key, block
+        return self._block[1][self._part]
 
 
-def _columns_of(path: Path, file: Any, order: Fields | None) -> tuple[list[Array], Fields]:
-    """Time, polarity and, if there are any, x and y."""
-    at, node = _place_of(path, file)
+def _find_columns(path: Path, file: Any, order: Fields | None) -> tuple[list[Array], Fields]:
+    """Find the columns time, polarity and perhaps x and y."""
+    at, node = _find_table(path, file)
     is_group = isinstance(node, h5py.Group)
-    names = [name for name in node if _is_own(node, name)] if is_group else list(node.dtype.names or ())
+    names = [name for name in node if _is_hard_link(node, name)] if is_group else list(node.dtype.names or ())
     listed = ", ".join(names) or "no fields"
     if order is not None and names:
         raise InputError(f"{path}: {at} has {listed}: columns= is for tables without names")
@@ -122,21 +124,21 @@ def _columns_of(path: Path, file: Any, order: Fields | None) -> tuple[list[Array
     return choose_columns(path, [at], lambda _: _DataSet(path, node), order, "hdf5:PATH?columns=txyp")
 
 
-def _place_of(path: Path, file: Any) -> tuple[str, Any]:
-    """Where the columns are: in one of `_PLACES`, or at the top, as in files of MATLAB."""
+def _find_table(path: Path, file: Any) -> tuple[str, Any]:
+    """Find the columns: under one of `_PLACES`, or at the top, as in files of MATLAB."""
     for place in _PLACES:
         node = file
         for part in place.split("/"):
-            inside = isinstance(node, h5py.Group) and part in node
-            if inside and not _is_own(node, part):
+            is_there = isinstance(node, h5py.Group) and part in node
+            if is_there and not _is_hard_link(node, part):
                 raise InputError(f"{path}: /{place} is a link, expected it in the file itself")
-            node = node[part] if inside else None
+            node = node[part] if is_there else None
         if node is not None:
             return f"/{place}", node
-    own = [name for name in file if _is_own(file, name)]
-    if fields_from_names(own) is not None:
+    names = [name for name in file if _is_hard_link(file, name)]
+    if fields_from_names(names) is not None:
         return "/", file
-    tables = [name for name in own if isinstance(file[name], h5py.Dataset)]
+    tables = [name for name in names if isinstance(file[name], h5py.Dataset)]
     if len(tables) == 1:
         return f"/{tables[0]}", file[tables[0]]
     raise InputError(
@@ -145,16 +147,16 @@ def _place_of(path: Path, file: Any) -> tuple[str, Any]:
     )
 
 
-def _is_own(group: Any, name: str) -> bool:
-    """Whether it lies in the file itself, not behind a link to another."""
+def _is_hard_link(group: Any, name: str) -> bool:
     return isinstance(group.get(name, getlink=True), h5py.HardLink)
 
 
-def _check(path: Path, dataset: Any) -> None:
-    """Refuse what is not in the file, or would take more room or time than a file of its size may.
+def _check_dataset(path: Path, dataset: Any) -> None:
+    """Check that a data set is in the file itself, and takes no more room or time than a file of its size
+    may.
 
     Raises:
-        InputError: Which it is.
+        InputError: It is not, or takes more.
     """
     if not isinstance(dataset, h5py.Dataset) or len(dataset.shape or ()) not in (1, 2):
         raise InputError(f"{path}: found {dataset.name}, expected a column of numbers")

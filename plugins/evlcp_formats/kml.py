@@ -1,6 +1,6 @@
 """`fixes.kml`: fixes and bars as points, the smoothed trajectory as lines, for Google Earth and GIS programs.
 
-Altitudes of KML are those above the sea's level, the geoid of EGM96.
+Altitudes in KML are above mean sea level, the geoid of EGM96.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ class Kml(Sink):
         self._trail = Trail()
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
-        """Write a fix that is given as a point, with its time where UTC is known."""
+        """Write an accepted fix as a point, with its time if UTC is known."""
         if filtered is None:
             return
         east, north, up = sigmas(fix.covariance_m2)
@@ -46,14 +46,16 @@ class Kml(Sink):
             when = f"<TimeStamp><when>{at:%Y-%m-%dT%H:%M:%S}.{at.microsecond // 1000:03d}Z</when></TimeStamp>"
         name = f"<name>{fix.t_us / 1e3:.1f} ms</name>"
         label = f"&#177; {east:.3f} E {north:.3f} N {up:.3f} U m"
-        where = _point(fix.longitude_deg, fix.latitude_deg, fix.height_m)
-        self._placemark(f"{name}{when}<styleUrl>#fix</styleUrl><description>{label}</description>{where}")
+        where = _format_point(fix.longitude_deg, fix.latitude_deg, fix.height_m)
+        self._write_placemark(
+            f"{name}{when}<styleUrl>#fix</styleUrl><description>{label}</description>{where}"
+        )
 
     def settle(self, settled: Sequence[Settled]) -> None:
         """Write the smoothed places as a line, one per trajectory."""
         for line in self._trail.lines(settled):
-            where = " ".join(_coordinates(*place) for place in line)
-            self._placemark(
+            where = " ".join(_format_coordinates(*place) for place in line)
+            self._write_placemark(
                 "<styleUrl>#track</styleUrl><LineString><altitudeMode>absolute</altitudeMode>"
                 f"<coordinates>{where}</coordinates></LineString>"
             )
@@ -62,20 +64,20 @@ class Kml(Sink):
         """Write the bars, and end the file."""
         assert self.run.navigator is not None
         for number, site in self.run.navigator.positioner.bars.known_sites.items():
-            where = _point(site.longitude_deg, site.latitude_deg, site.height_m)
-            self._placemark(f"<name>bar {number}, id {site.transmitter_id}</name>{where}")
+            where = _format_point(site.longitude_deg, site.latitude_deg, site.height_m)
+            self._write_placemark(f"<name>bar {number}, id {site.transmitter_id}</name>{where}")
         self._file.write("</Document></kml>\n")
         return {}
 
-    def _placemark(self, content: str) -> None:
+    def _write_placemark(self, content: str) -> None:
         self._file.write(f"<Placemark>{content}</Placemark>\n")
 
 
-def _point(longitude_deg: float, latitude_deg: float, height_m: float) -> str:
-    where = _coordinates(longitude_deg, latitude_deg, height_m)
+def _format_point(longitude_deg: float, latitude_deg: float, height_m: float) -> str:
+    where = _format_coordinates(longitude_deg, latitude_deg, height_m)
     return f"<Point><altitudeMode>absolute</altitudeMode><coordinates>{where}</coordinates></Point>"
 
 
-def _coordinates(longitude_deg: float, latitude_deg: float, height_m: float) -> str:
-    sea = geoid_m(latitude_deg, longitude_deg)
-    return f"{longitude_deg:.9f},{latitude_deg:.9f},{height_m - sea:.3f}"
+def _format_coordinates(longitude_deg: float, latitude_deg: float, height_m: float) -> str:
+    altitude_m = height_m - geoid_m(latitude_deg, longitude_deg)
+    return f"{longitude_deg:.9f},{latitude_deg:.9f},{altitude_m:.3f}"

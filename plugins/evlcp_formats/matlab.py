@@ -1,4 +1,4 @@
-"""Files of MATLAB up to version 7: arrays by their names, or a table, those inside of structures too."""
+"""Read files of MATLAB up to version 7: arrays by their names, or a table, also inside structures."""
 
 import math
 from collections.abc import Mapping
@@ -21,17 +21,16 @@ _MOST_BYTES: Final = 300_000_000
 
 def open_mat(url: str) -> ColumnSource:
     """Open a file, or `list:PATH` with options."""
-    return open_list(url, _read)
+    return open_list(url, _read_file)
 
 
-def _read(path: Path, _: ExitStack, fields: Fields | None) -> EventTable:
-    """The list of events in a file."""
-    arrays = _arrays(path)
+def _read_file(path: Path, _: ExitStack, fields: Fields | None) -> EventTable:
+    arrays = _load_arrays(path)
     columns, found = choose_columns(path, list(arrays), arrays.__getitem__, fields)
     return EventTable("MAT", split_pieces(columns, path.stat().st_size), found.unit)
 
 
-def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
     from scipy.io import loadmat, whosmat
 
     try:

@@ -14,15 +14,15 @@ from evlcp_sdk.values import Fix
 
 _NO_FIX, _FIX = -1, 0
 _UNKNOWN, _KNOWN = 0, 3
-"""Of a covariance: whether it is known, in full."""
+"""Types of a covariance."""
 
 TOPIC: Final = "/evlcp/fix"
 
 
 class NavSat(Sink):
-    """Writes `navsat.mcap`: the filtered place at each fix; those that are refused have the status NO_FIX.
+    """Writes `navsat.mcap`: the filtered place at each fix; refused ones have the status NO_FIX.
 
-    Stamps are UTC where that is known, or else the camera's clock.
+    Stamps are UTC if it is known, or else the camera's clock.
     """
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
@@ -32,20 +32,20 @@ class NavSat(Sink):
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a message."""
         stamp_ns = to_utc_ns(self.run.clock_zero, fix.t_us)
-        place, covariance_m2, status, known = (np.nan,) * 3, np.zeros((3, 3)), _NO_FIX, _UNKNOWN
+        place, covariance_m2, status, covariance_type = (np.nan,) * 3, np.zeros((3, 3)), _NO_FIX, _UNKNOWN
         if filtered is not None:
             place = filtered.latitude_deg, filtered.longitude_deg, filtered.height_m
-            covariance_m2, status, known = filtered.covariance_m2, _FIX, _KNOWN
+            covariance_m2, status, covariance_type = filtered.covariance_m2, _FIX, _KNOWN
         latitude, longitude, height = place
-        message = self._bag.make(
+        message = self._bag.make_message(
             "sensor_msgs/msg/NavSatFix",
-            header=self._bag.header(stamp_ns),
-            status=self._bag.make("sensor_msgs/msg/NavSatStatus", status=status, service=0),
+            header=self._bag.make_header(stamp_ns),
+            status=self._bag.make_message("sensor_msgs/msg/NavSatStatus", status=status, service=0),
             latitude=float(latitude),
             longitude=float(longitude),
             altitude=float(height),
             position_covariance=np.ascontiguousarray(covariance_m2, np.float64).ravel(),
-            position_covariance_type=known,
+            position_covariance_type=covariance_type,
         )
         self._bag.write(TOPIC, message, stamp_ns)
 

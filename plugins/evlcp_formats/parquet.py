@@ -21,10 +21,10 @@ class FramesParquet(Sink):
         import pyarrow.parquet
 
         super().__init__(folder, run)
-        whole, real = pyarrow.int64(), pyarrow.float64()
-        types = [whole, whole, whole, real, pyarrow.list_(whole), *[real] * 5, whole]
+        integer, number = pyarrow.int64(), pyarrow.float64()
+        types = [integer, integer, integer, number, pyarrow.list_(integer), *[number] * 5, integer]
         self._columns = frame_columns(filtered=run.filtered, links=bool(run.links))
-        types += [real] * (len(self._columns) - len(types))
+        types += [number] * (len(self._columns) - len(types))
         if self._columns[-1] == LINK_COLUMN:
             types[-1] = pyarrow.string()
         self._schema = pyarrow.schema(list(zip(self._columns, types, strict=True)))
@@ -34,7 +34,7 @@ class FramesParquet(Sink):
     def packet(self, packet: Packet) -> None:
         """Keep the frames, and write a group when there are enough."""
         for frame in packet.frames:
-            self._waiting.append({name: _known(frame_value(frame, name)) for name in self._columns})
+            self._waiting.append({name: _to_json(frame_value(frame, name)) for name in self._columns})
             if len(self._waiting) == self.GROUP:
                 self._flush()
 
@@ -55,6 +55,6 @@ class FramesParquet(Sink):
         return {}
 
 
-def _known(value: Any) -> Any:
-    """A value, or None for NaN and infinity."""
+def _to_json(value: Any) -> Any:
+    """Return a value, or None for NaN and infinity."""
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,4 +1,4 @@
-"""Bags of ROS 2, written without ROS: one MCAP file, its messages packed by `rosbags`."""
+"""Write bags of ROS 2 without ROS: one MCAP file, its messages packed by `rosbags`."""
 
 from pathlib import Path
 from typing import IO, Any, Final
@@ -18,17 +18,17 @@ _DEFINITIONS: Final = {
     EVENT_PACKET: "std_msgs/Header header\nuint32 height\nuint32 width\nuint64 seq\nuint64 time_base\n"
     "string encoding\nbool is_bigendian\nuint8[] events\n"
 }
-"""Of the types that are not ROS 2's own."""
+"""Definitions of types that are not ROS 2's own."""
 
 _PACKET_US: Final = 10_000
-"""How much time a packet of events has at the most."""
+"""Most time of a packet of events."""
 
 
 class RosBag:
-    """Messages of ROS 2 written into one MCAP file, as `ros2 bag play` reads it.
+    """Writes messages of ROS 2 into one MCAP file, as `ros2 bag play` reads it.
 
     Args:
-        file: Where it goes; not closed.
+        file: The file; not closed.
 
     Raises:
         ConfigError: `mcap` or `rosbags` is not installed.
@@ -43,17 +43,17 @@ class RosBag:
         self._writer.start(profile="ros2", library="evlcp-sdk")
         self._channels: dict[str, int] = {}
 
-    def make(self, kind: str, **values: Any) -> Any:
-        """A message, or a part of one, of a type."""
+    def make_message(self, kind: str, **values: Any) -> Any:
+        """Make a message, or a part of one, of a type."""
         return self._store.types[kind](**values)
 
-    def header(self, at_ns: int) -> Any:
-        """The header of a message of the camera's."""
-        stamp = self.make("builtin_interfaces/msg/Time", sec=at_ns // 10**9, nanosec=at_ns % 10**9)
-        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id="camera")
+    def make_header(self, at_ns: int) -> Any:
+        """Make the header of a message of the camera."""
+        stamp = self.make_message("builtin_interfaces/msg/Time", sec=at_ns // 10**9, nanosec=at_ns % 10**9)
+        return self.make_message("std_msgs/msg/Header", stamp=stamp, frame_id="camera")
 
     def write(self, topic: str, message: Any, at_ns: int) -> None:
-        """Write a message; the topic is of its type from the first one on."""
+        """Write a message; the first one of a topic fixes its type."""
         kind = message.__msgtype__
         if topic not in self._channels:
             text, _ = self._store.generate_msgdef(kind, ros_version=2)
@@ -70,9 +70,9 @@ class RosBag:
 
 
 class EventBagWriter(EventWriter):
-    """A bag of `event_camera_msgs/EventPacket`, EVT3 inside, being written: a message each 10 ms.
+    """Writes a bag of `event_camera_msgs/EventPacket` with EVT3 words, a message every 10 ms.
 
-    Messages are stamped by the camera's clock. What is read back is what was written.
+    Messages are stamped by the camera's clock. The bag reads back as it was written.
 
     Raises:
         ConfigError: `mcap` or `rosbags` is not installed, or the sensor is larger than the words can address.
@@ -106,14 +106,14 @@ class EventBagWriter(EventWriter):
             np.searchsorted(triggers.t_us, ends_us).tolist(),
             strict=True,
         ):
-            self._packet(events[i:n], triggers[j:m], end_us)
+            self._write_packet(events[i:n], triggers[j:m], end_us)
             i, j = n, m
 
-    def _packet(self, events: Events, triggers: Triggers, end_us: int) -> None:
+    def _write_packet(self, events: Events, triggers: Triggers, end_us: int) -> None:
         words = b"".join(self._encoder.encode(events, triggers))
-        message = self._bag.make(
+        message = self._bag.make_message(
             EVENT_PACKET,
-            header=self._bag.header(end_us * 1000),
+            header=self._bag.make_header(end_us * 1000),
             height=self.height,
             width=self.width,
             seq=self._seq,

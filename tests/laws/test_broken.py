@@ -437,7 +437,7 @@ CASES = [
 def test_the_law_finds_the_fault(role, name, algorithm, message):
     law = next(law for law in laws_of(role) if law.name == name)
     with pytest.raises(LawError, match=message):
-        law.hold(Subject(role, algorithm))
+        law.apply(Subject(role, algorithm))
 
 
 @pytest.mark.parametrize("role", ROLES)

@@ -4,7 +4,7 @@ import pytest
 
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.testing import laws_of
-from evlcp_sdk.testing.law import Subject, judge
+from evlcp_sdk.testing.law import Subject, apply_law
 
 REGISTRY = Registry.load()
 DO_NOTHING = {
@@ -24,7 +24,7 @@ CASES = [
 @pytest.mark.parametrize(("role", "id", "law"), CASES)
 def test_law(role, id, law):
     algorithm = REGISTRY.load_class(role, id)()
-    outcome = judge(law, Subject(role, algorithm), {})
+    outcome = apply_law(law, Subject(role, algorithm), {})
     if outcome.status == "skipped":
         # A law that is skipped for a reason of its own making would hide a fault.
         assert (role, id) in DO_NOTHING

@@ -113,7 +113,7 @@ def test_a_whole_link(evlcp, monkeypatch):
         bad = (subject.role, law.name) == ("decoding", "inverts")
         return Verdict(law, "failed" if bad else "ok", "symbol 3, got 4" if bad else "")
 
-    monkeypatch.setattr(suite, "judge", hold)
+    monkeypatch.setattr(suite, "apply_law", hold)
     done = evlcp("check", "--set", "modulation.id=wh8")
     assert done.code == 1
     assert "modulation 'wh8'" in done.out

@@ -25,7 +25,7 @@ from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.sim import load_scene
 from evlcp_sdk.simulated import SimulatedSource, simulate
-from evlcp_sdk.testing.recordings import merged
+from evlcp_sdk.testing.recordings import merge_events
 from evlcp_sdk.values import Events
 
 LINK = load_link()
@@ -225,7 +225,7 @@ def survey_of(times_us: NDArray[np.float64]) -> LightSurvey:
     t_us = np.concatenate([rises_us.ravel(), rises_us.ravel() + 40])
     x, y = (np.tile(at.ravel(), 2) for at in (pixel % 8, pixel // 8))
     survey = LightSurvey(64, 64)
-    survey.feed(merged(Events.of(t_us, x, y, np.repeat([1, 0], rises_us.size))))
+    survey.feed(merge_events(Events.of(t_us, x, y, np.repeat([1, 0], rises_us.size))))
     return survey
 
 

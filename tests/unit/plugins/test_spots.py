@@ -5,7 +5,7 @@ import pytest
 from evlcp_regions.spots import Spots
 
 from evlcp_sdk.link.resolve import resolve
-from evlcp_sdk.testing.recordings import merged
+from evlcp_sdk.testing.recordings import merge_events
 from evlcp_sdk.values import Events
 
 ONE = {"rows": 1, "columns": 1, "cluster_rows": 1, "cluster_columns": 1}
@@ -36,7 +36,7 @@ def events_of(rng, rate_hz, seconds, burst, noise_hz):
     noise = (rng.uniform(0, most, n) for most in (seconds * 1e6, 1279, 719))
     t, x, y = (np.concatenate(both) for both in zip((t, x, y), noise, strict=True))
     p = np.concatenate([p, rng.integers(0, 2, n)])
-    return merged(Events.of(np.floor(t), np.rint(x), np.rint(y), p))
+    return merge_events(Events.of(np.floor(t), np.rint(x), np.rint(y), p))
 
 
 def regions_of(link, events, seconds):
@@ -89,7 +89,7 @@ def move_events(events, right, share, late_us, rng):
     """Some of the events elsewhere and later, as a lens scatters light and dim pixels see it."""
     kept = rng.random(len(events)) < share
     t = events.t_us[kept] + late_us + rng.integers(0, 40, int(kept.sum()))
-    return merged(Events.of(t, events.x[kept].astype(np.int64) + right, events.y[kept], events.p[kept]))
+    return merge_events(Events.of(t, events.x[kept].astype(np.int64) + right, events.y[kept], events.p[kept]))
 
 
 def places_of(found, from_us, x_px):
@@ -112,7 +112,7 @@ def test_what_the_lens_scatters_is_no_light_and_a_dim_one_beside_is(rate_hz, lat
     dim = events_of(rng, rate_hz, seconds, 28, 0.0)
     noise = events_of(rng, rate_hz, seconds, 1, 10_000.0)
     flare, dim = move_events(bright, -70, 0.3, late_us, rng), move_events(dim, 60, 1.0, late_us, rng)
-    found = regions_of(link_of(rate_hz), merged(bright, flare, dim, noise), seconds)
+    found = regions_of(link_of(rate_hz), merge_events(bright, flare, dim, noise), seconds)
     half_us = int(seconds * 5e5)
     assert places_of(found, half_us, 0) == 1
     assert places_of(found, half_us, 60) > 0.97
@@ -126,7 +126,7 @@ def beside_one_another(rng, places):
         one = events_of(rng, 10_000.0, 0.3, 60, 0.0)
         part = one[(one.t_us >= from_s * 1e6) & (one.t_us < until_s * 1e6)]
         parts.append(Events.of(part.t_us, part.x, part.y + down, part.p))
-    return merged(*parts)
+    return merge_events(*parts)
 
 
 def test_a_large_light_is_one_though_its_places_come_and_go():

@@ -19,7 +19,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.compose import compose
 from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.testing.recordings import merged
+from evlcp_sdk.testing.recordings import merge_events
 from evlcp_sdk.values import Events
 
 BAR = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
@@ -69,7 +69,7 @@ def light_of_bytes(
     t, p = np.concatenate(times), np.concatenate(polarities)
     kept = t >= start_us + cut_bits * bit_us if cut_bits else np.ones(len(t), np.bool_)
     n = int(kept.sum())
-    return merged(Events.of(np.floor(t[kept]), np.zeros(n), np.zeros(n), p[kept]))
+    return merge_events(Events.of(np.floor(t[kept]), np.zeros(n), np.zeros(n), p[kept]))
 
 
 def wrong_bits(found, sent, data_bits):

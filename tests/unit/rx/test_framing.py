@@ -11,7 +11,7 @@ from rx_streams import LINK, frames_of, lit, noise_events, receive_cut
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.alignment import polarity_sums
 from evlcp_sdk.rx.transmitters import PacketGrid, RowDelay, measure_row_delay
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merge_events, random_symbols
 from evlcp_sdk.values import Events, SyncLock
 
 CHIP_US, ZERO_US = 100.5, 1234.5
@@ -137,7 +137,7 @@ def test_hidden_rows_and_noise_are_outliers():
     hidden = (events.y > 300) & (events.y < 350)
     early = (events.y > 400) & (events.y < 425)
     moved = Events.of(events.t_us - 60 * early, events.x, events.y, events.p)[~hidden]
-    noisy = merged(moved, noise_events(2e6, 90_000))
+    noisy = merge_events(moved, noise_events(2e6, 90_000))
     assert measure(noisy)[0] == pytest.approx(0.2, abs=0.03)
 
 

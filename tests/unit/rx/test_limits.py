@@ -14,7 +14,7 @@ from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.regions import EVENT_BYTES, PIECE_BYTES, RhythmTracker
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.testing.recordings import merged
+from evlcp_sdk.testing.recordings import merge_events
 from evlcp_sdk.values import Events
 
 SPEC = RegionSpec(step_us=1000)
@@ -25,7 +25,7 @@ def blobs(columns, rows, until_us):
     """Blobs of 9 px in a grid of 60 px, each with a code of its own."""
     places = product(range(15, 60 * columns, 60), range(15, 60 * rows, 60))
     small = {"cluster_px": 9 / 16, "width_px": 3, "start_us": 0}
-    found = merged(*(lit(4, k, x_px=x, y_px=y, **small)[1] for k, (x, y) in enumerate(places)))
+    found = merge_events(*(lit(4, k, x_px=x, y_px=y, **small)[1] for k, (x, y) in enumerate(places)))
     return found[: found.t_us.searchsorted(until_us)]
 
 

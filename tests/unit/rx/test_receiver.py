@@ -14,7 +14,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.framing import SkippedFrame
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merge_events, random_symbols
 from evlcp_sdk.values import Events, PresenceMap, replace_fields
 
 
@@ -101,7 +101,7 @@ def flashes(start_us, seed=7):
     rng = np.random.default_rng(seed)
     x, y = (v.ravel() for v in np.meshgrid(np.arange(350, 450), np.arange(270, 430)))
     t = start_us + (200 * (np.arange(10) + rng.random((x.size, 10)))).astype(np.int64)
-    return merged(Events.of(t.ravel(), np.repeat(x, 10), np.repeat(y, 10), np.ones(t.size)))
+    return merge_events(Events.of(t.ravel(), np.repeat(x, 10), np.repeat(y, 10), np.ones(t.size)))
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_a_step_of_light_costs_the_frame_that_it_drowns(drowned, start_us, which
     bar, events = lit(4, shake_px=16, start_us=start_us)
     first_us = int(bar.start_us) + 100 * (frame_chip(LINK, *which) + LINK.packet.pilot_chips)
     lost = drowned & (events.t_us > first_us + 200) & (events.t_us < first_us + 1400)
-    receiver, packets = receive_cut(LINK, merged(events[~lost], flashes(first_us)))
+    receiver, packets = receive_cut(LINK, merge_events(events[~lost], flashes(first_us)))
     frames = frames_of(packets)
     assert len(frames) == sum(start_us + 100 * frame_chip(LINK, *divmod(n, 10)) >= 0 for n in range(40))
     for f in frames:
@@ -130,7 +130,7 @@ def test_events_that_come_sooner_in_brighter_light(sooner_us):
     bar = IdealBar(random_symbols(LINK, 3))
     e = ideal_events(LINK, bar, delay_on_us=70.0, delay_off_us=70.0)
     bright = e.t_us >= bar.start_us + 100 * frame_chip(LINK, 1, 3) + 60
-    moved = merged(Events.of(e.t_us - sooner_us * bright, e.x, e.y, e.p)[~bright | (e.x % 2 == 0)])
+    moved = merge_events(Events.of(e.t_us - sooner_us * bright, e.x, e.y, e.p)[~bright | (e.x % 2 == 0)])
     assert right_frames(receive_cut(LINK, moved)[1], bar, late_us=(0, 90)) == 30
 
 
@@ -179,7 +179,7 @@ def test_two_bars_a_few_pixels_apart_are_two(apart_px):
     bars, events = zip(
         lit(3, 1, start_us=0), lit(3, 2, start_us=12_345, x_px=400.3 + apart_px, ppm=40), strict=True
     )
-    _, packets = receive_cut(LINK, merged(*events))
+    _, packets = receive_cut(LINK, merge_events(*events))
     for bar in bars:
         mine = [p for p in packets if abs(p.frames[0].x_px - bar.x_px + 0.5) < 1]
         assert len({p.transmitter for p in mine}) == 1
@@ -235,7 +235,7 @@ def test_a_transmitter_that_starts_anew_is_another(at_us):
     starts = (5000, -60), (at_us - 13_210, 80), (at_us + 90_000, 0)
     bars, sent = zip(*(lit(6, k, start_us=us, ppm=ppm) for k, (us, ppm) in enumerate(starts)), strict=True)
     begins = 0, at_us, at_us + 100_000, 300_000
-    events = merged(*(e[slice(*e.t_us.searchsorted(begins[k : k + 2]))] for k, e in enumerate(sent)))
+    events = merge_events(*(e[slice(*e.t_us.searchsorted(begins[k : k + 2]))] for k, e in enumerate(sent)))
     # The camera is said to lean, which every frame that is read contradicts.
     receiver, packets = receive_cut(LINK, events, attitude=Attitude(6.0, 5.0))
     assert receiver.counts["restarts"] == 2
@@ -252,7 +252,7 @@ def test_a_transmitter_that_starts_anew_is_another(at_us):
         assert [p.packet for p in mine] == list(range(len(mine)))
 
 
-STREAM = merged(
+STREAM = merge_events(
     lit(3, 3, shake_px=5, ppm=35)[1],
     lit(3, 4, x_px=800, start_us=9000, cluster_px=5)[1],
     noise_events(30_000, 130_000),

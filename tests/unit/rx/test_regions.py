@@ -14,7 +14,7 @@ from evlcp_sdk.rx.regions import BarPlace, RegionTrack, RhythmTracker
 from evlcp_sdk.rx.rhythm import BlinkDetector
 from evlcp_sdk.rx.sweeps import find_sweeps, fit_sweep, has_chip_rhythm
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.testing.recordings import ideal_events, merged, random_symbols
+from evlcp_sdk.testing.recordings import ideal_events, merge_events, random_symbols
 from evlcp_sdk.values import Events
 
 SPEC = RegionSpec(step_us=1000)
@@ -94,7 +94,9 @@ def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_a
     hidden = (BAR_EVENTS.y >= 392) & (BAR_EVENTS.t_us < (30_000 if shows_again else 60_000))
     leaf = BAR_EVENTS[(BAR_EVENTS.x == 399) & (BAR_EVENTS.y < 306) & (BAR_EVENTS.t_us >= 15_000)]
     regions = follower()
-    for start, found in step_regions(regions, merged(BAR_EVENTS[~hidden], raise_events(leaf, 9)), 60_000):
+    for start, found in step_regions(
+        regions, merge_events(BAR_EVENTS[~hidden], raise_events(leaf, 9)), 60_000
+    ):
         if start == 12_000:
             (region,) = found
             regions.correct_region(region, BarPlace(region.latest.t_us, CENTRE, SIZE, (-64.0, 32.0)))
@@ -104,7 +106,7 @@ def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_a
 
 @pytest.mark.parametrize("merge_px", [8, 15, 16, 32])
 def test_bars_farther_apart_than_the_gap_are_two_regions_for_every_gap(merge_px):
-    events = merged(BAR_EVENTS, ideal_events(LINK, replace(BAR, x_px=500, start_us=5300)))
+    events = merge_events(BAR_EVENTS, ideal_events(LINK, replace(BAR, x_px=500, start_us=5300)))
     found = follow(events, 30_000, replace(SPEC, merge_px=merge_px))[29_000]
     assert sorted(round(t.latest.x_px) for t in found) == [400, 500]
 
@@ -123,7 +125,7 @@ def test_what_fades_is_released():
 )
 def test_lamps_and_noise_are_no_regions(hz, duty):
     lamp = lamp_events(300, 300, 20, hz, 60_000, duty=duty)
-    assert not any(follow(merged(lamp, noise_events(500_000, 60_000)), 60_000).values())
+    assert not any(follow(merge_events(lamp, noise_events(500_000, 60_000)), 60_000).values())
 
 
 def test_a_moving_edge_is_no_region():
@@ -195,7 +197,7 @@ def test_a_region_does_not_go_on_to_the_bar_below():
     """Four dark rows are between them, and the region seems to move there by 7 px a step."""
     below = CENTRE[0], CENTRE[1] + 132
     regions = follower()
-    events = merged(BAR_EVENTS, ideal_events(LINK, replace(BAR, y_px=BAR.y_px + 132), seed=2))
+    events = merge_events(BAR_EVENTS, ideal_events(LINK, replace(BAR, y_px=BAR.y_px + 132), seed=2))
     for start, found in step_regions(regions, events, 40_000):
         if start == 10_000:
             (own,) = found

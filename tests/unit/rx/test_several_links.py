@@ -11,7 +11,7 @@ from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.simulated import simulate
-from evlcp_sdk.testing.recordings import merged
+from evlcp_sdk.testing.recordings import merge_events
 from evlcp_sdk.values import replace_fields
 
 
@@ -43,7 +43,7 @@ def right(packets, link, bar):
 @pytest.mark.parametrize("links", [(BAR, HALF), (WH8, BAR)], ids=lambda links: links[-1].name)
 def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(links):
     (one, here), (two, there) = light_at(links[0], LEFT), light_at(links[1], RIGHT)
-    receiver, packets = receive_cut(list(links), merged(here, there))
+    receiver, packets = receive_cut(list(links), merge_events(here, there))
     assert right(packets, links[0], one) == len(one.symbols) * 10
     assert right(packets, links[1], two) == len(two.symbols) * 10
     numbers = {p.transmitter: p.link for p in packets}
@@ -56,7 +56,7 @@ def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(links):
 
 
 def test_what_is_received_alone_is_the_same_with_another_link_beside():
-    events = merged(light_at(BAR, LEFT)[1], light_at(BAR, RIGHT)[1], noise_events(20_000, 120_000))
+    events = merge_events(light_at(BAR, LEFT)[1], light_at(BAR, RIGHT)[1], noise_events(20_000, 120_000))
     alone, single = receive_cut(BAR, events)
     _, both = receive_cut([BAR, SLOW], events)
     assert [frame_content(replace_fields(f, link="bar")) for f in frames_of(single)] == [
@@ -70,7 +70,7 @@ def test_what_is_received_alone_is_the_same_with_another_link_beside():
 def test_a_place_that_is_left_is_free_for_another_link():
     one, first = light_at(BAR, LEFT, 0.1)
     two, second = light_at(WH8, LEFT, 0.1, start_us=400_000.0)
-    packets = receive_cut([BAR, WH8], merged(first, second))[1]
+    packets = receive_cut([BAR, WH8], merge_events(first, second))[1]
     early = [p for p in packets if p.t_us < 300_000]
     late = [p for p in packets if p.t_us > 300_000]
     assert right(early, BAR, one) == len(one.symbols) * 10

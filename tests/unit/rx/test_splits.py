@@ -14,7 +14,7 @@ from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import AttitudeLog
-from evlcp_sdk.testing.recordings import merged
+from evlcp_sdk.testing.recordings import merge_events
 from evlcp_sdk.values import Events
 
 FEW_PILOTS = load_link(overrides=["air.pilot_every=4"])
@@ -30,7 +30,7 @@ LAMP = replace(
 )
 _, OWN = lit(3, ppm=50, shake_px=6, shake_hz=12)
 _, OTHER = lit(3, 1, x_px=900.7, y_px=300.2, start_us=19_350)
-BOTH = merged(OWN, OTHER, noise_events(120_000, 200_000))
+BOTH = merge_events(OWN, OTHER, noise_events(120_000, 200_000))
 
 
 def few_pilots():
@@ -45,25 +45,25 @@ def growing_together():
     """A bar comes nearer to another by a column a step."""
     _, near = lit(3, 2, x_px=440, start_us=10_000)
     moved = Events.of(near.t_us, near.x - np.minimum(near.t_us // 1500, 40), near.y, near.p)
-    return merged(lit(3, 1)[1], moved)
+    return merge_events(lit(3, 1)[1], moved)
 
 
 def a_rail():
     """It shows the bar again, cut and with events missing."""
     part = OWN[(OWN.y < 370) & (np.random.default_rng(1).random(len(OWN)) >= 0.4)]
-    return merged(OWN, Events.of(part.t_us + 7, part.x + 80, part.y + 20, part.p))
+    return merge_events(OWN, Events.of(part.t_us + 7, part.x + 80, part.y + 20, part.p))
 
 
 def two_links():
     _, lamp = lit(6, link=LAMP, x_px=800.7, cluster_px=4.0, width_px=2)
-    return merged(lit(2, link=BAR, x_px=300.3)[1], lamp)
+    return merge_events(lit(2, link=BAR, x_px=300.3)[1], lamp)
 
 
 def crowd():
     """Eight blinking blobs, a bar and noise: more than small limits let in."""
     small = {"y_px": 120, "cluster_px": 0.6, "width_px": 3}
     blobs = (lit(3, n, x_px=60.0 * n, start_us=300 * n, **small)[1] for n in range(1, 9))
-    return merged(OWN, *blobs, noise_events(1_700_000, 120_000))
+    return merge_events(OWN, *blobs, noise_events(1_700_000, 120_000))
 
 
 T_US = np.linspace(0, 50_000, 50)
@@ -150,7 +150,7 @@ def test_frames_from_before_the_first_lock_come_a_few_a_step():
 
 
 def test_of_several_links_a_frame_comes_at_once_where_its_transmitter_holds_its_place():
-    events = merged(lit(7, link=BAR, x_px=300.3)[1], lit(7, 1, link=WH8, x_px=800.7)[1])
+    events = merge_events(lit(7, link=BAR, x_px=300.3)[1], lit(7, 1, link=WH8, x_px=800.7)[1])
     frames = frames_by_slices([BAR, WH8], events, 250)
     assert Counter(frame.link for frame, _ in frames) == {"wh4x2": 70, "wh8": 70}
     late_us = [max(lateness([f for f in frames if f[0].packet == n], events)) for n in range(7)]

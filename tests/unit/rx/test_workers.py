@@ -14,11 +14,11 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx import workers
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.testing.recordings import merged
+from evlcp_sdk.testing.recordings import merge_events
 
 _, OWN = lit(3, ppm=50, shake_px=6, shake_hz=12)
 _, OTHER = lit(3, 1, x_px=900.7, y_px=300.2, start_us=19_350)
-EVENTS = merged(OWN, OTHER, noise_events(20_000, 120_000))
+EVENTS = merge_events(OWN, OTHER, noise_events(20_000, 120_000))
 
 
 @dataclass(frozen=True)
