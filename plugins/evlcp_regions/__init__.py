@@ -1,4 +1,4 @@
-"""What counts as a transmitter in the image: what blinks in the rhythm of the chips, or all of it."""
+"""Detection of transmitters in the image: by the rhythm of the chips, as single spots, or the whole of it."""
 
 from collections.abc import Iterator
 

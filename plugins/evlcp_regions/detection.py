@@ -1,4 +1,4 @@
-"""The two detections: by rhythm, and none."""
+"""Detection by the rhythm of the chips, and of the whole image as one region."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
@@ -14,12 +14,12 @@ from evlcp_sdk.values import Events, Region
 
 @dataclass(frozen=True)
 class Rhythmic(Detection):
-    """What blinks in the rhythm of the chips, followed; its parameters are the table `[regions]`."""
+    """What blinks in the rhythm of the chips; its parameters are the table `[regions]`."""
 
     rhythmic: ClassVar[bool] = True
 
     def compile(self, camera: CameraModel, codebook: Codebook, packet: PacketFormat) -> Detector:
-        """Not asked for."""
+        """Never called: the receiver has a tracker of its own."""
         raise NotImplementedError
 
 
@@ -55,8 +55,8 @@ class _WholeImage:
 
     def step(self, state: _State, start_us: int, events: Events) -> tuple[_State, list[Region]]:
         if len(events):
-            again = state.last_us is not None and int(events.t_us[0]) - state.last_us > self.pause_us
-            state = _State(state.number + again, int(events.t_us[-1]))
+            is_new = state.last_us is not None and int(events.t_us[0]) - state.last_us > self.pause_us
+            state = _State(state.number + is_new, int(events.t_us[-1]))
         if state.last_us is None or start_us - state.last_us > self.pause_us:
             return state, []
         centre = (self.width - 1) / 2, (self.height - 1) / 2

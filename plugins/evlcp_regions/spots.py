@@ -1,4 +1,4 @@
-"""The light of single LEDs: small spots from which bursts of events of one polarity come, in turn."""
+"""Detect single LEDs: small spots from which bursts of events come, ON and OFF in turn."""
 
 import math
 from collections.abc import Sequence
@@ -16,33 +16,33 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
 _CELL_PX, _FINE_PX = 32, 8
-"""Cells in which new spots are looked for, and those in which known ones are."""
+"""Cells in which new spots are sought, and those in which known ones are."""
 
 _SLOTS_PER_BIT, _LONGEST_SLOT_US = 2, 500
 """An edge wakes its burst within a slot: half a bit, or what a burst takes at the most."""
 
-_LEAST, _PURE = 6, 0.7
-"""Events of a burst, and by how much more of them are of one polarity than of the other."""
+_LEAST_EVENTS, _LEAST_PURITY = 6, 0.7
+"""Events of a burst, and the share by which one polarity prevails among them."""
 
-_TURNS = 6
+_LEAST_TURNS = 6
 """Bursts of the other polarity than the one before, with no long time between, that show a spot."""
 
 _BURST_SHARE = 0.35
-"""Bursts of a spot that is known have at least so much of its usual number of events: what the lens scatters
-of its edges has a third at the most, and must not be taken for it while it is dark for long."""
+"""Share of its usual events that a burst of a known spot has: what the lens scatters of its edges has a third
+at the most, and must not be taken for a burst while the spot is dark for long."""
 
-_AGILE_US = 4000.0
-"""Time in which the image of a light that shakes takes another speed."""
+_AGILITY_US = 4000.0
+"""Time in which the image of a shaking light changes its velocity."""
 
-_VEIL_PX, _VEIL = 128.0, 2.5
-"""How far around a light lenses scatter some of it, and how much brighter it is than what they make of it."""
+_VEIL_PX, _VEIL_RATIO = 128.0, 2.5
+"""How far around a light lenses scatter some of it, and how much brighter it is than what they scatter."""
 
-_ALIKE, _LEARNT_TURNS = 0.5, 12
-"""Correlation with the events of a much brighter light, slot by slot, from which on a light is but what the
-lens scatters of it: less than three quarters of its power come at other instants. And turns by which that is
-known: with fewer, two lights of random bits are as alike by chance."""
+_SCATTER_CORRELATION, _DECIDING_TURNS = 0.5, 12
+"""Correlation with the events of a much brighter light, slot by slot, from which on a light is only scattered
+by the lens: less than three quarters of its power come at other instants. And turns after which that is
+known: with fewer, two lights of random bits correlate as much by chance."""
 
-_SCATTERED = 6.0
+_SCATTER_RATIO = 6.0
 """How much brighter a light is than what its halo wakes here and there as the image shakes, which has no
 edges to compare: a bright LED at 30 m woke bursts of a ninth of its own."""
 
@@ -50,46 +50,49 @@ _LAG_US = 1000.0
 """How much later dim pixels see an edge than bright ones, at the most."""
 
 _MOST_VEILED = 4
-"""Lights, the brightest, that are followed to see whether they have edges of their own: there may be many."""
+"""Lights in another's veil, the brightest, that are followed to see whether they have edges of their own:
+there may be many."""
 
 _LARGE_PX = 64.0
-"""Three lights so near one another that none is much brighter are places of one that is larger, as a bar."""
+"""Three lights so near one another that none is much brighter are places of one larger light, such as a
+bar."""
 
-_BESIDE_PX = 48.0
-"""How far apart neighbours among the places of one light are at the most: lights are at least 24 px apart, so
-that between places further from one another there is room for one more."""
+_NEIGHBOUR_PX = 48.0
+"""Largest distance of neighbours among the places of one light: lights are at least 24 px apart, so that
+between places farther from one another there is room for one more."""
 
 _PART_US = 100_000.0
 """How long a light is still taken for a place of a larger one: such places wander, and come and go."""
 
-_FAINTER = 1.5
-"""How much brighter a light is than those that come later and are but scattered by the lens, or its trail:
+_FAINT_RATIO = 1.5
+"""How much brighter a light is than those that come later and are only scattered by the lens, or its trail:
 places of a large light are about as bright as one another, and seen at about one time."""
 
 _YOUNG_US = 6000.0
-"""Age from which a light is given: until then others may show that it is a place of a larger one."""
+"""Age from which on a light is reported: until then others may show that it is a place of a larger one."""
 
 _MOST_GATE_PX = 64.0
-"""How far from where it should be a spot is looked for at the most."""
+"""How far from its predicted place a spot is sought at the most."""
 
 _SIZE_PX = 2.0
 """Root mean square of a light's events about its centre before it is known: a lens' blur of some pixels."""
 
 _BOX_SIZES = 2.5
-"""A box reaches so far by that size: 99 of 100 events, were they spread as a normal distribution."""
+"""Half of a box, in that size: it holds 99 of 100 events of a normal distribution."""
 
-_LEARN_BURST, _LEARN_SIZE = 0.2, 0.1
-"""How much one burst says of the next one's events, and a step of the size: the means of five and of ten."""
+_BURST_GAIN, _SIZE_GAIN = 0.2, 0.1
+"""Weight of a burst in its usual events, and of a step in the size: the means of five and of ten."""
 
 _BLUR_PX = 4.0
-"""Half of a spot's box beyond the light that is seen: its halo, and the way it makes in a step."""
+"""Half of a spot's box beyond the visible light: its halo, and its way in a step."""
 
 
 @dataclass(frozen=True)
 class Spots(Detection):
     """Small lights that go on and off, each followed by its bursts, and by its motion while it is on.
 
-    For one LED: rates of bits from a hundred to tens of thousands a second, dark and lit for many bits.
+    For single LEDs at a hundred to tens of thousands of bits a second, which may be dark or lit for many
+    bits.
     """
 
     reach_px: Annotated[float, Field(gt=2, le=64, description="How far from its centre a light is seen.")] = (
@@ -107,8 +110,8 @@ class Spots(Detection):
         """For the size of the sensor and the rate of the bits."""
         chip_us = packet.chip_us
         slot_us = min(chip_us / _SLOTS_PER_BIT, _LONGEST_SLOT_US)
-        apart_us = 2 * codebook.longest_gap_chips * chip_us
-        return _SpotDetector(self, camera.width, camera.height, slot_us, apart_us)
+        gap_us = 2 * codebook.longest_gap_chips * chip_us
+        return _SpotDetector(self, camera.width, camera.height, slot_us, gap_us)
 
 
 @dataclass(frozen=True)
@@ -120,41 +123,42 @@ class _Spot:
         t_us: When it was seen last, us.
         x_px: Its column at that time.
         y_px: Its row.
-        right: Columns a us that it moves.
-        down: Rows a us.
-        size_px: Root mean square of how far from its centre events are.
-        burst: Usual events of a burst in which the light turns; not of the trail, while bright pixels go on.
+        right_px_us: Its velocity in columns.
+        down_px_us: Its velocity in rows.
+        size_px: Root mean square of the distances of events from its centre.
+        burst: Usual events of a burst in which the light turns; not of the trail, while bright pixels
+            go on.
         lit: The last burst was ON.
         turned_us: When the polarity of its bursts changed last, us.
         found_us: When it was found, us.
-        own: It is no part of what the lens scatters of another, as far as is known.
-        alike: Products of its events and a brighter light's by lag, and the squares of either: see `_alike`.
-        turns: Its turns beside a much brighter light, at one place beside it.
-        off_px: Where that is: (right, down) of the brighter light.
-        part_us: When it was seen last that it is a place of a larger light, us.
+        is_source: It is not scattered by the lens from another light, as far as is known.
+        correlation: Of its events with those of a brighter light, see `_SpotDetector._correlate`.
+        turns: Its turns beside a much brighter light, at one offset from it.
+        offset_px: This offset to the right and down.
+        part_us: When it was last seen to be a place of a larger light, us.
     """
 
     id: int
     t_us: float
     x_px: float
     y_px: float
-    right: float
-    down: float
+    right_px_us: float
+    down_px_us: float
     size_px: float
     burst: float
     lit: bool
     turned_us: float
     found_us: float
-    own: bool = True
-    alike: tuple[float, ...] = ()
+    is_source: bool = True
+    correlation: tuple[float, ...] = ()
     turns: int = 0
-    off_px: tuple[float, float] = (0.0, 0.0)
+    offset_px: tuple[float, float] = (0.0, 0.0)
     part_us: float = -math.inf
 
 
 @dataclass(frozen=True)
-class _Turns:
-    """Bursts of a cell: whether the last was ON, how often that changed, and when it did last, us."""
+class _CellTurns:
+    """Bursts of a cell: whether the last was ON, how often that has changed, and when it did last, us."""
 
     lit: bool
     turns: int
@@ -163,10 +167,10 @@ class _Turns:
 
 @dataclass(frozen=True)
 class _State:
-    """Lights that are followed, turns of cells by number, and the number of the next light."""
+    """Followed lights, turns of cells by number, and the number of the next light."""
 
     spots: tuple[_Spot, ...] = ()
-    cells: dict[int, _Turns] = field(default_factory=dict)
+    cells: dict[int, _CellTurns] = field(default_factory=dict)
     next_id: int = 0
 
 
@@ -176,56 +180,61 @@ class _SpotDetector:
     width: int
     height: int
     slot_us: float
-    apart_us: float
+    gap_us: float
 
     def init(self) -> _State:
         return _State()
 
     def step(self, state: _State, start_us: int, events: Events) -> tuple[_State, list[Region]]:
         now_us = float(events.t_us[-1]) if len(events) else float(start_us)
-        moved: list[_Spot] = []
+        spots: list[_Spot] = []
         regions: list[Region] = []
-        places = self._all_followed(state.spots, start_us, now_us, events)
+        places = self._follow_spots(state.spots, start_us, now_us, events)
         for before, (seen, x_px, y_px) in zip(state.spots, places, strict=True):
-            beside = any(_apart(x_px, y_px, other) < self.spec.reach_px for other in moved)
-            faded = now_us - seen.turned_us > self.spec.fade_us
-            if not (beside or faded):
-                moved.append(self._judged(before, seen, (x_px, y_px), places, start_us, events))
-                regions.append(self._region(seen, x_px, y_px, now_us))
-        cells, new = self._turned(state.cells, start_us, events)
+            is_double = any(_distance_px(x_px, y_px, other) < self.spec.reach_px for other in spots)
+            has_faded = now_us - seen.turned_us > self.spec.fade_us
+            if not (is_double or has_faded):
+                spots.append(self._assess_spot(before, seen, (x_px, y_px), places, start_us, events))
+                regions.append(self._make_region(seen, x_px, y_px, now_us))
+        cells, new = self._update_cells(state.cells, start_us, events)
         next_id = state.next_id
         for spot in new:
-            veil = _brighter(spot, moved) is not None
-            gone = self._making_way(spot, moved, veil=veil)
-            if gone is None:
+            is_veiled = _find_brighter(spot, spots) is not None
+            displaced = self._find_displaced(spot, spots, is_veiled=is_veiled)
+            if displaced is None:
                 continue
-            regions = [region for region in regions if region.id not in {one.id for one in gone}]
-            moved = [one for one in moved if one.id not in {other.id for other in gone}]
-            moved.append(replace(spot, id=next_id, own=not veil))
-            regions.append(self._region(moved[-1], spot.x_px, spot.y_px, now_us))
+            ids = {other.id for other in displaced}
+            regions = [region for region in regions if region.id not in ids]
+            spots = [other for other in spots if other.id not in ids]
+            spots.append(replace(spot, id=next_id, is_source=not is_veiled))
+            regions.append(self._make_region(spots[-1], spot.x_px, spot.y_px, now_us))
             next_id += 1
-        moved = _with_parts(moved, now_us)
+        spots = _mark_parts(spots, now_us)
         single = [
             region
-            for region, spot in zip(regions, moved, strict=True)
-            if spot.own and now_us - spot.found_us >= _YOUNG_US and spot.turned_us - spot.part_us > _PART_US
+            for region, spot in zip(regions, spots, strict=True)
+            if spot.is_source
+            and now_us - spot.found_us >= _YOUNG_US
+            and spot.turned_us - spot.part_us > _PART_US
         ]
-        return _State(tuple(moved), cells, next_id), single
+        return _State(tuple(spots), cells, next_id), single
 
-    def _making_way(self, spot: _Spot, moved: list[_Spot], *, veil: bool) -> list[_Spot] | None:
-        """Which spots, not known to be lights of their own, make way for a new one; None: that does."""
-        near = [other for other in moved if _apart(spot.x_px, spot.y_px, other) < 2 * self.spec.reach_px]
-        here = any(_apart(spot.x_px, spot.y_px, other) < self.spec.reach_px for other in near)
-        if here or any(other.own or veil for other in near):
+    def _find_displaced(self, spot: _Spot, spots: list[_Spot], *, is_veiled: bool) -> list[_Spot] | None:
+        """Spots that give way to a new one, as they may be scattered; None if the new one gives way."""
+        near = [
+            other for other in spots if _distance_px(spot.x_px, spot.y_px, other) < 2 * self.spec.reach_px
+        ]
+        is_known = any(_distance_px(spot.x_px, spot.y_px, other) < self.spec.reach_px for other in near)
+        if is_known or any(other.is_source or is_veiled for other in near):
             return None
-        gone = list(near)
-        if veil:
-            gone += _dimmest([other for other in moved if not other.own], spot, _MOST_VEILED)
-        if len(moved) - len(gone) >= self.spec.most:
-            gone += _dimmest(moved, spot, self.spec.most)
-        return None if any(one is spot for one in gone) else gone
+        displaced = list(near)
+        if is_veiled:
+            displaced += _find_excess([other for other in spots if not other.is_source], spot, _MOST_VEILED)
+        if len(spots) - len(displaced) >= self.spec.most:
+            displaced += _find_excess(spots, spot, self.spec.most)
+        return None if any(other is spot for other in displaced) else displaced
 
-    def _judged(
+    def _assess_spot(
         self,
         before: _Spot,
         spot: _Spot,
@@ -234,42 +243,45 @@ class _SpotDetector:
         start_us: int,
         events: Events,
     ) -> _Spot:
-        """A light with what a step says of whether it is but what the lens scatters of a brighter one."""
-        other = _brighter(spot, [one for one, _, _ in places])
+        """Assess by the events of a step whether the lens scatters a light from a brighter one."""
+        other = _find_brighter(spot, [one for one, _, _ in places])
         if other is None:
             return spot
-        beside = next((x, y) for one, x, y in places if one is other)
-        off_px = place[0] - beside[0], place[1] - beside[1]
-        off = max(abs(one - then) for one, then in zip(off_px, spot.off_px, strict=True))
-        turned = before.lit != spot.lit
-        if spot.alike and turned and off > self.spec.reach_px:
+        other_place = next((x, y) for one, x, y in places if one is other)
+        offset_px = place[0] - other_place[0], place[1] - other_place[1]
+        moved_px = max(abs(a - b) for a, b in zip(offset_px, spot.offset_px, strict=True))
+        has_turned = before.lit != spot.lit
+        if spot.correlation and has_turned and moved_px > self.spec.reach_px:
             # Two lights shake together; what does not is a halo's.
-            return replace(spot, own=False, alike=(), turns=0)
-        turns = spot.turns + turned
+            return replace(spot, is_source=False, correlation=(), turns=0)
+        turns = spot.turns + has_turned
         # One that was there before is a light of its own until it shows that it is not.
-        own = spot.own and (bool(spot.alike) or spot.found_us + _YOUNG_US < other.found_us)
-        alike = self._alike(place, beside, start_us, events)
-        if spot.alike:
-            alike = tuple(one + more for one, more in zip(spot.alike, alike, strict=True))
-        if turns >= _LEARNT_TURNS:
-            *products, mine, its = alike
-            own = other.burst < _SCATTERED * spot.burst and max(products) < _ALIKE * math.sqrt(mine * its)
-        return replace(spot, own=own, alike=alike, turns=turns, off_px=spot.off_px if spot.alike else off_px)
+        is_older = spot.found_us + _YOUNG_US < other.found_us
+        is_source = spot.is_source and (bool(spot.correlation) or is_older)
+        correlation = self._correlate(place, other_place, start_us, events)
+        if spot.correlation:
+            correlation = tuple(a + b for a, b in zip(spot.correlation, correlation, strict=True))
+            offset_px = spot.offset_px
+        if turns >= _DECIDING_TURNS:
+            *products, mine, its = correlation
+            limit = _SCATTER_CORRELATION * math.sqrt(mine * its)
+            is_source = other.burst < _SCATTER_RATIO * spot.burst and max(products) < limit
+        return replace(spot, is_source=is_source, correlation=correlation, turns=turns, offset_px=offset_px)
 
-    def _alike(
+    def _correlate(
         self, place: tuple[float, float], other: tuple[float, float], start_us: int, events: Events
     ) -> tuple[float, ...]:
-        """How alike events are at two places in a step, slot by slot.
+        """Correlate the events of a step at two places, slot by slot.
 
-        Products of ON less OFF events at the first place with those at the second so many slots before, for
-        each lag; and the sums of the squares at either.
+        Products of ON less OFF events at the first place with those at the second one some slots before, by
+        lag; and the sums of the squares at either.
         """
         slots = []
         lags = int(_LAG_US / self.slot_us) + 2
         for x_px, y_px in (place, other):
             x, y = np.abs(events.x - x_px), np.abs(events.y - y_px)
             inside = (x <= self.spec.reach_px) & (y <= self.spec.reach_px)
-            slot = self._slots(events.t_us[inside], start_us)
+            slot = self._slot_numbers(events.t_us[inside], start_us)
             signed = 2.0 * events.p[inside] - 1.0
             slots.append(np.bincount(slot, signed) if len(slot) else np.zeros(1))
         mine, its = (np.pad(one, (0, max(map(len, slots)) - len(one))) for one in slots)
@@ -281,22 +293,22 @@ class _SpotDetector:
         ]
         return *products, float(mine @ mine), float(its @ its)
 
-    def _region(self, spot: _Spot, x_px: float, y_px: float, now_us: float) -> Region:
+    def _make_region(self, spot: _Spot, x_px: float, y_px: float, now_us: float) -> Region:
         side = 2 * (min(max(_BOX_SIZES * spot.size_px, _BLUR_PX), self.spec.reach_px) + _BLUR_PX) + 1
         return Region(spot.id, now_us, x_px, y_px, side, side)
 
-    def _all_followed(
+    def _follow_spots(
         self, spots: Sequence[_Spot], start_us: int, now_us: float, events: Events
     ) -> list[tuple[_Spot, float, float]]:
-        """Lights after a step, and where they are in it; dark dim ones take no bright one's events."""
-        found: dict[int, tuple[_Spot, float, float]] = {}
+        """Follow lights through a step, the brightest first; return them with their places in it."""
+        followed: dict[int, tuple[_Spot, float, float]] = {}
         x, y = events.x.astype(np.float64), events.y.astype(np.float64)
         for spot in sorted(spots, key=lambda one: -one.burst):
-            brighter = [(x, y) for one, x, y in found.values() if one.burst > _VEIL * spot.burst]
-            found[spot.id] = self._followed(spot, start_us, now_us, events, (x, y), brighter)
-        return [found[spot.id] for spot in spots]
+            brighter = [(x, y) for one, x, y in followed.values() if one.burst > _VEIL_RATIO * spot.burst]
+            followed[spot.id] = self._follow_spot(spot, start_us, now_us, events, (x, y), brighter)
+        return [followed[spot.id] for spot in spots]
 
-    def _followed(
+    def _follow_spot(
         self,
         spot: _Spot,
         start_us: int,
@@ -305,28 +317,31 @@ class _SpotDetector:
         places: tuple[NDArray[np.float64], NDArray[np.float64]],
         others: Sequence[tuple[float, float]],
     ) -> tuple[_Spot, float, float]:
-        """A light after a step, and where it is in it: seen there, or where it should be.
+        """Follow a light through a step; return it with its place in it, seen or predicted.
 
-        Events are at these places, columns and rows; what is in reach of the places of others is theirs.
+        `places` are the columns and rows of the events; those within reach of the brighter lights at `others`
+        belong to these.
         """
-        away_us = max(now_us - spot.t_us, 0.0)
-        straight_us = _AGILE_US * (1 - math.exp(-away_us / _AGILE_US))
-        x_px, y_px = spot.x_px + spot.right * straight_us, spot.y_px + spot.down * straight_us
-        gate_px = min(self.spec.reach_px + self.spec.speed_px_ms * away_us * 1e-3, _MOST_GATE_PX)
+        unseen_us = max(now_us - spot.t_us, 0.0)
+        straight_us = _AGILITY_US * (1 - math.exp(-unseen_us / _AGILITY_US))
+        x_px, y_px = spot.x_px + spot.right_px_us * straight_us, spot.y_px + spot.down_px_us * straight_us
+        gate_px = min(self.spec.reach_px + self.spec.speed_px_ms * unseen_us * 1e-3, _MOST_GATE_PX)
         x, y = places
-        wanted = (np.abs(x - x_px) <= gate_px) & (np.abs(y - y_px) <= gate_px)
+        mine = (np.abs(x - x_px) <= gate_px) & (np.abs(y - y_px) <= gate_px)
         for u_px, v_px in others:
-            wanted &= (np.abs(x - u_px) > self.spec.reach_px) | (np.abs(y - v_px) > self.spec.reach_px)
-        near = np.flatnonzero(wanted)
-        if len(near) < _LEAST:
+            mine &= (np.abs(x - u_px) > self.spec.reach_px) | (np.abs(y - v_px) > self.spec.reach_px)
+        near = np.flatnonzero(mine)
+        if len(near) < _LEAST_EVENTS:
             return spot, x_px, y_px
         x, y, t, on = x[near], y[near], events.t_us[near], events.p[near] > 0
-        slot = self._slots(t, start_us)
-        burst = self._burst(x, y, slot, on, max(_LEAST, _BURST_SHARE * spot.burst), (x_px, y_px, gate_px))
+        slot = self._slot_numbers(t, start_us)
+        burst = self._find_burst(
+            x, y, slot, on, max(_LEAST_EVENTS, _BURST_SHARE * spot.burst), (x_px, y_px, gate_px)
+        )
         if burst is not None:
-            u_px, v_px, many, lit = burst
+            u_px, v_px, number, lit = burst
             if lit != spot.lit:
-                usual = spot.burst + _LEARN_BURST * (many - spot.burst)
+                usual = spot.burst + _BURST_GAIN * (number - spot.burst)
                 spot = replace(spot, burst=usual, lit=lit, turned_us=now_us)
         elif spot.lit:
             u_px, v_px = x_px, y_px
@@ -335,28 +350,28 @@ class _SpotDetector:
         reach_px = self.spec.reach_px
         for _ in range(2):
             inside = (np.abs(x - u_px) <= reach_px) & (np.abs(y - v_px) <= reach_px)
-            if inside.sum() < _LEAST:
+            if inside.sum() < _LEAST_EVENTS:
                 return spot, x_px, y_px
             u_px, v_px = float(x[inside].mean()), float(y[inside].mean())
         t_us = float(t[inside].mean())
         size_px = float(np.sqrt(((x[inside] - u_px) ** 2 + (y[inside] - v_px) ** 2).mean() / 2))
         since_us = max(t_us - spot.t_us, 1.0)
-        share = since_us / (since_us + _AGILE_US)
-        most = self.spec.speed_px_ms * 1e-3
-        right = spot.right + share * ((u_px - spot.x_px) / since_us - spot.right)
-        down = spot.down + share * ((v_px - spot.y_px) / since_us - spot.down)
+        share = since_us / (since_us + _AGILITY_US)
+        most_px_us = self.spec.speed_px_ms * 1e-3
+        right_px_us = spot.right_px_us + share * ((u_px - spot.x_px) / since_us - spot.right_px_us)
+        down_px_us = spot.down_px_us + share * ((v_px - spot.y_px) / since_us - spot.down_px_us)
         spot = replace(
             spot,
             t_us=t_us,
             x_px=u_px,
             y_px=v_px,
-            right=min(max(right, -most), most),
-            down=min(max(down, -most), most),
-            size_px=spot.size_px + _LEARN_SIZE * (size_px - spot.size_px),
+            right_px_us=min(max(right_px_us, -most_px_us), most_px_us),
+            down_px_us=min(max(down_px_us, -most_px_us), most_px_us),
+            size_px=spot.size_px + _SIZE_GAIN * (size_px - spot.size_px),
         )
         return spot, u_px, v_px
 
-    def _burst(
+    def _find_burst(
         self,
         x: NDArray[np.float64],
         y: NDArray[np.float64],
@@ -365,7 +380,7 @@ class _SpotDetector:
         least: float,
         gate: tuple[float, float, float],
     ) -> tuple[float, float, float, bool] | None:
-        """The burst of the most events near a place: column, row, how many, and whether ON; None for none."""
+        """Find the burst of the most events near a place: (column, row, events, whether ON); None of none."""
         x_px, y_px, gate_px = gate
         cells = int(2 * gate_px / _FINE_PX) + 2
         column = ((x - x_px + gate_px) / _FINE_PX).astype(np.int64)
@@ -374,49 +389,49 @@ class _SpotDetector:
         index = (slot * cells + row) * cells + column
         every = np.bincount(index, minlength=slots * cells * cells).reshape(slots, cells, cells)
         ones = np.bincount(index[on], minlength=slots * cells * cells).reshape(slots, cells, cells)
-        every, ones = (many[:, :-1] + many[:, 1:] for many in (every, ones))
-        every, ones = (many[..., :-1] + many[..., 1:] for many in (every, ones))
-        more = np.abs(2 * ones - every)
-        more[more < _PURE * every] = 0
-        best = int(more.argmax())
-        if more.flat[best] < least:
+        every, ones = (counts[:, :-1] + counts[:, 1:] for counts in (every, ones))
+        every, ones = (counts[..., :-1] + counts[..., 1:] for counts in (every, ones))
+        excess = np.abs(2 * ones - every)
+        excess[excess < _LEAST_PURITY * every] = 0
+        best = int(excess.argmax())
+        if excess.flat[best] < least:
             return None
-        _, v, u = np.unravel_index(best, more.shape)
+        _, v, u = np.unravel_index(best, excess.shape)
         # The light is as its last burst left it.
-        last = int(np.flatnonzero(more[:, v, u] >= 0.5 * more.flat[best])[-1])
+        last = int(np.flatnonzero(excess[:, v, u] >= 0.5 * excess.flat[best])[-1])
         lit = bool(2 * ones[last, v, u] > every[last, v, u])
         u_px, v_px = x_px - gate_px + (int(u) + 1) * _FINE_PX, y_px - gate_px + (int(v) + 1) * _FINE_PX
-        return u_px, v_px, float(more.flat[best]), lit
+        return u_px, v_px, float(excess.flat[best]), lit
 
-    def _slots(self, t_us: NDArray[np.int64], start_us: int) -> NDArray[np.int64]:
-        """In which slot of a step events are; those from before it are in its first."""
+    def _slot_numbers(self, t_us: NDArray[np.int64], start_us: int) -> NDArray[np.int64]:
+        """Slots of a step that events lie in; those from before it lie in its first."""
         return np.maximum(np.floor((t_us - start_us) / self.slot_us).astype(np.int64), 0)
 
-    def _turned(
-        self, cells: dict[int, _Turns], start_us: int, events: Events
-    ) -> tuple[dict[int, _Turns], list[_Spot]]:
-        """Cells by the bursts of a step, and lights that they show."""
-        known = {cell: turns for cell, turns in cells.items() if start_us - turns.t_us <= self.apart_us}
-        if len(events) < _LEAST:
+    def _update_cells(
+        self, cells: dict[int, _CellTurns], start_us: int, events: Events
+    ) -> tuple[dict[int, _CellTurns], list[_Spot]]:
+        """Update the turns of cells by the bursts of a step; return them and the lights that they show."""
+        known = {cell: turns for cell, turns in cells.items() if start_us - turns.t_us <= self.gap_us}
+        if len(events) < _LEAST_EVENTS:
             return known, []
         columns = -(-self.width // _CELL_PX)
-        many = columns * -(-self.height // _CELL_PX)
+        cell_count = columns * -(-self.height // _CELL_PX)
         cell = events.y.astype(np.int64) // _CELL_PX * columns + events.x.astype(np.int64) // _CELL_PX
-        slot = self._slots(events.t_us, start_us)
-        index = slot * many + cell
+        slot = self._slot_numbers(events.t_us, start_us)
+        index = slot * cell_count + cell
         every = np.bincount(index)
         signed = np.bincount(index, 2.0 * events.p.astype(np.float64) - 1.0)
-        bursts = np.flatnonzero((every >= _LEAST) & (np.abs(signed) >= _PURE * every))
+        bursts = np.flatnonzero((every >= _LEAST_EVENTS) & (np.abs(signed) >= _LEAST_PURITY * every))
         new = []
         for at in bursts.tolist():
-            which, t_us = at % many, start_us + (at // many + 0.5) * self.slot_us
+            number, t_us = at % cell_count, start_us + (at // cell_count + 0.5) * self.slot_us
             lit = bool(signed[at] > 0)
-            before = known.get(which)
-            if before is None or t_us - before.t_us > self.apart_us:
-                known[which] = _Turns(lit, 0, t_us)
+            before = known.get(number)
+            if before is None or t_us - before.t_us > self.gap_us:
+                known[number] = _CellTurns(lit, 0, t_us)
             elif before.lit != lit:
-                known[which] = _Turns(lit, before.turns + 1, t_us)
-                if before.turns + 1 >= _TURNS:
+                known[number] = _CellTurns(lit, before.turns + 1, t_us)
+                if before.turns + 1 >= _LEAST_TURNS:
                     inside = index == at
                     place = _median(events.x[inside]), _median(events.y[inside])
                     spot = _Spot(-1, t_us, *place, 0.0, 0.0, _SIZE_PX, float(every[at]), lit, t_us, t_us)
@@ -425,58 +440,58 @@ class _SpotDetector:
 
 
 def _median(values: NDArray[np.uint16]) -> float:
-    """As NumPy's, which takes ten times as long for some tens of values."""
+    """The same as `np.median`, in a tenth of the time for some tens of values."""
     ordered, n = np.sort(values), len(values)
     return (int(ordered[(n - 1) // 2]) + int(ordered[n // 2])) / 2
 
 
-def _brighter(spot: _Spot, others: Sequence[_Spot]) -> _Spot | None:
-    """The brightest light that is so near, and so much brighter, that the lens may scatter this one of it."""
+def _find_brighter(spot: _Spot, others: Sequence[_Spot]) -> _Spot | None:
+    """The brightest light that is so near, and so much brighter, that the lens may scatter this one."""
     near = [
         other
         for other in others
-        if other.burst > _VEIL * spot.burst and _apart(spot.x_px, spot.y_px, other) < _VEIL_PX
+        if other.burst > _VEIL_RATIO * spot.burst and _distance_px(spot.x_px, spot.y_px, other) < _VEIL_PX
     ]
     return max(near, key=lambda other: other.burst, default=None)
 
 
-def _dimmest(spots: Sequence[_Spot], new: _Spot, most: int) -> list[_Spot]:
-    """What must go so that a new light is one of so many: nothing, the dimmest, or the new one itself."""
+def _find_excess(spots: Sequence[_Spot], new: _Spot, most: int) -> list[_Spot]:
+    """What a new light leaves no room for among `most`: nothing, the dimmest one, or the new one itself."""
     if len(spots) < most:
         return []
-    least = min(spots, key=lambda one: one.burst)
-    return [new] if least.burst >= new.burst else [least]
+    dimmest = min(spots, key=lambda spot: spot.burst)
+    return [new] if dimmest.burst >= new.burst else [dimmest]
 
 
-def _with_parts(spots: Sequence[_Spot], now_us: float) -> list[_Spot]:
-    """Lights with when each was seen to be a place of a larger one, by itself or as a neighbour of one."""
+def _mark_parts(spots: Sequence[_Spot], now_us: float) -> list[_Spot]:
+    """Mark the lights that are places of a larger one, by themselves or as neighbours of such places."""
     seen_us = [
-        now_us if sum(_is_beside(spot, other, _LARGE_PX) for other in spots) >= 2 else spot.part_us
+        now_us if sum(_is_same_light(spot, other, _LARGE_PX) for other in spots) >= 2 else spot.part_us
         for spot in spots
     ]
-    # From one to the next: the ends of a large light have a neighbour on one side only.
+    # On to neighbours: the ends of a large light have one on one side only.
     for k in sorted(range(len(spots)), key=lambda k: -seen_us[k]):
         waiting = [k]
         while waiting:
             part = waiting.pop()
             for j, spot in enumerate(spots):
-                if seen_us[j] < seen_us[part] and _is_beside(spot, spots[part], _BESIDE_PX):
+                if seen_us[j] < seen_us[part] and _is_same_light(spot, spots[part], _NEIGHBOUR_PX):
                     seen_us[j] = seen_us[part]
                     waiting.append(j)
     return [replace(spot, part_us=then) for spot, then in zip(spots, seen_us, strict=True)]
 
 
-def _is_beside(spot: _Spot, other: _Spot, reach_px: float) -> bool:
-    """Whether another light is as near and as bright as a place of one light that both are of."""
+def _is_same_light(spot: _Spot, other: _Spot, reach_px: float) -> bool:
+    """Whether another light is so near and so bright that both may be places of one light."""
     return (
         other.id != spot.id
-        and other.own
-        and _apart(spot.x_px, spot.y_px, other) < reach_px
-        and other.burst < _VEIL * spot.burst
-        and spot.burst < _VEIL * other.burst
-        and not (other.found_us > spot.found_us + _YOUNG_US and spot.burst > _FAINTER * other.burst)
+        and other.is_source
+        and _distance_px(spot.x_px, spot.y_px, other) < reach_px
+        and other.burst < _VEIL_RATIO * spot.burst
+        and spot.burst < _VEIL_RATIO * other.burst
+        and not (other.found_us > spot.found_us + _YOUNG_US and spot.burst > _FAINT_RATIO * other.burst)
     )
 
 
-def _apart(x_px: float, y_px: float, spot: _Spot) -> float:
+def _distance_px(x_px: float, y_px: float, spot: _Spot) -> float:
     return max(abs(x_px - spot.x_px), abs(y_px - spot.y_px))
