@@ -24,8 +24,8 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.study.frames import frames_of
-from evlcp_sdk.study.match import match
-from evlcp_sdk.study.task import plan_of
+from evlcp_sdk.study.match import match_frames
+from evlcp_sdk.study.task import plan_campaign
 
 CAMPAIGN = Path(__file__).parents[1] / "examples" / "campaigns" / "road.toml"
 DECODINGS = ("motion-feedback", "ml-soft", "wh-transform")
@@ -49,7 +49,7 @@ def frame_qualities(scene: Scene, seed: int) -> Qualities:
         rows = frames_of(packets)
         frames = (frame for packet in packets for frame in packet.frames)
         quality = {id(row): frame.soft.quality for row, frame in zip(rows, frames, strict=True)}
-        matched, own = match(rows, source.truth), found.setdefault(decoding, [])
+        matched, own = match_frames(rows, source.truth), found.setdefault(decoding, [])
         for sent, pairs in zip(matched.bars, matched.pairs, strict=True):
             for row, number in pairs:
                 symbols = np.array(row.symbols)
@@ -90,7 +90,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
     args = parser.parse_args()
-    scenes = [case.value for case in plan_of(args.campaign).scenes]
+    scenes = [case.value for case in plan_campaign(args.campaign).scenes]
     work = [(scene, seed) for scene in scenes for seed in range(1, args.seeds + 1)]
     with ProcessPoolExecutor(args.jobs) as pool:
         found = list(pool.map(frame_qualities, *zip(*work, strict=True)))

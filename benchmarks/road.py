@@ -37,8 +37,8 @@ from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.sim import Truth, read_truth, truth_path
 from evlcp_sdk.study.compare import load_variants
 from evlcp_sdk.study.frames import read_frames
-from evlcp_sdk.study.match import match
-from evlcp_sdk.study.measure import bar_tallies
+from evlcp_sdk.study.match import match_frames
+from evlcp_sdk.study.measure import tally_bar
 from evlcp_sdk.study.score import score_frames
 from evlcp_sdk.study.tally import Statistics, Tally
 
@@ -127,7 +127,7 @@ def measure(path: Path, make: Make, table: Mapping[str, Any], tool: Path, rounds
             if summary["status"] != "complete":
                 raise EvlcpError(str(summary["error"]))
             frames = read_frames(out)
-            found = match(frames, truth)
+            found = match_frames(frames, truth)
         except Exception as fault:  # whatever ends one recording must not end the table
             return result | {"fault": f"{type(fault).__name__}: {fault}".splitlines()[0]}
         ours, other = score_frames(frames, truth)["road"], independent(tool, out, truth_path(path))
@@ -139,7 +139,7 @@ def measure(path: Path, make: Make, table: Mapping[str, Any], tool: Path, rounds
             "warnings": [warning["code"] for warning in summary["warnings"]],
             "independent": "absent" if other is None else "agrees" if other == ours else "differs",
         }
-        for number, bar in enumerate(Statistics.of(bar_tallies(*one)) for one in bars):
+        for number, bar in enumerate(Statistics.of(tally_bar(*one)) for one in bars):
             targets = targets_of(table, name, number)
             result["bars"].append(
                 {

@@ -26,7 +26,7 @@ from evlcp_sdk.sim import Scene, Simulation, truth_of
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import summarize
 from evlcp_sdk.study.tally import Statistics, Tally
-from evlcp_sdk.study.task import plan_of
+from evlcp_sdk.study.task import plan_campaign
 from evlcp_sdk.values import Events
 
 ROOT = Path(__file__).parents[2]
@@ -221,7 +221,7 @@ def draw_scenes(scenes: Sequence[tuple[str, Scene]], path: Path, window_us: int 
 def scenes_to_show() -> list[tuple[str, Scene]]:
     """The third step of each condition, cut in the middle of what happens in it."""
     found: dict[str, list[tuple[str, Scene]]] = {}
-    for case in plan_of(CAMPAIGN).scenes:
+    for case in plan_campaign(CAMPAIGN).scenes:
         name = str(case.labels["variant"])
         found.setdefault(name.partition(": ")[0], []).append((name, case.value))
     scenes = []

@@ -107,12 +107,12 @@ def _is_campaign(url: str) -> bool:
 
 
 def _of_results(path: Path) -> Comparison:
-    from evlcp_sdk.study.comparison import of_campaign
+    from evlcp_sdk.study.comparison import compare_links
     from evlcp_sdk.study.store import Store
     from evlcp_sdk.study.summary import summarize
 
     with Store(path) as store:
-        return of_campaign(summarize(store))
+        return compare_links(summarize(store))
 
 
 def _of_recordings(
@@ -169,7 +169,7 @@ def _show(comparison: Comparison, paths: Sequence[Path]) -> None:
     out = console()
     for one in comparison.tables:
         out.print(one.name, style="bold")
-        head, lines = one.cells()
+        head, lines = one.format_rows()
         # The best have a mark behind them.
         print_table(out, head, [[t if best else f"{t} " for t, best in line] for line in lines], best=MARK)
         out.print()

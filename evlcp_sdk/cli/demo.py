@@ -66,13 +66,13 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     from evlcp_sdk.cli._common import make_executor
     from evlcp_sdk.files import Outputs, writing
     from evlcp_sdk.report.drawing import save_plots
-    from evlcp_sdk.study.collect import collect
-    from evlcp_sdk.study.report import charts_of, page
+    from evlcp_sdk.study.collect import collect_results
+    from evlcp_sdk.study.report import draw_charts, render_campaign
     from evlcp_sdk.study.store import Store
     from evlcp_sdk.study.summary import summarize
-    from evlcp_sdk.study.task import plan_of, run_job
+    from evlcp_sdk.study.task import plan_campaign, run_job
 
-    plan = plan_of(demo_campaign())
+    plan = plan_campaign(demo_campaign())
     if not as_json:
         console().print(f"simulating and receiving {len(plan.jobs)} stretches of a drive ...", style="dim")
     with writing(out):
@@ -85,14 +85,14 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
             # Here, where it shows and is done once: what each worker would compile by itself.
             job = plan.jobs[0]
             run_job(replace(job, scene=replace(job.scene, duration_s=_FIRST_S)))
-            progress = collect(plan, store, make_executor(workers, None), run_job, show_progress)
+            progress = collect_results(plan, store, make_executor(workers, None), run_job, show_progress)
         summary = summarize(store)
     show_faults(progress)
     if progress.faults:
         raise typer.Exit(max(fault.exit_code for _, fault in progress.faults))
     with Outputs() as outputs:
-        save_plots(charts_of(summary), summary.plan.name, out, outputs)
-        outputs.write_text(page(summary), out / "report.html")
+        save_plots(draw_charts(summary), summary.plan.name, out, outputs)
+        outputs.write_text(render_campaign(summary), out / "report.html")
         outputs.commit()
     if as_json:
         print_json(summary.to_dict())
@@ -105,8 +105,8 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
 
 def show_drive(summary: Summary) -> None:
     """Print bits, BER with 95 % confidence and RMSE of each segment of distance beside the paper's."""
-    from evlcp_sdk.study.intervals import measure
-    from evlcp_sdk.study.summary import beside_paper
+    from evlcp_sdk.study.intervals import measure_figure
+    from evlcp_sdk.study.summary import compare_with_paper
     from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
     (series,) = summary.series
@@ -115,13 +115,13 @@ def show_drive(summary: Summary) -> None:
             f"{'≤ ' if c.reference.bound else ''}{c.reference.value:g}",
             "as good" if c.verdict == "agrees" else c.verdict,
         )
-        for c in beside_paper([series])
+        for c in compare_with_paper([series])
         for begin in range(c.reference.from_m, c.reference.to_m, SEGMENT_M)
     }
     rows = []
     for begin, recordings in reversed(series.segments):
-        tally = Tally.together(recordings)
-        ber, rmse = measure(recordings, "ber"), measure(recordings, "rmse_m")
+        tally = Tally.sum(recordings)
+        ber, rmse = measure_figure(recordings, "ber"), measure_figure(recordings, "rmse_m")
         bits, metres = (paper.get((kind, begin), ("-", "-")) for kind in ("ber", "rmse_m"))
         rows.append(
             (

@@ -41,7 +41,7 @@ def report(
     """
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.report.drawing import save_plots
-    from evlcp_sdk.study.report import charts_of, page
+    from evlcp_sdk.study.report import draw_charts, render_campaign
     from evlcp_sdk.study.store import Store
     from evlcp_sdk.study.summary import summarize
 
@@ -52,9 +52,9 @@ def report(
     folder = figures or (out.parent / f"{out.stem}-figures" if out is not None else None)
     with Outputs() as outputs:
         if folder is not None:
-            save_plots(charts_of(summary), summary.plan.name, folder, outputs)
+            save_plots(draw_charts(summary), summary.plan.name, folder, outputs)
         if out is not None:
-            outputs.write_text(page(summary), out)
+            outputs.write_text(render_campaign(summary), out)
         outputs.commit()
     if as_json:
         print_json(summary.to_dict(), 1)
@@ -88,12 +88,12 @@ def as_markdown(summary: Summary) -> str:
 
 def _tables(summary: Summary) -> list[tuple[Sequence[str], Sequence[Sequence[str]], int]]:
     """Head and rows of each table that has rows, and how many of its columns say what a row is."""
-    from evlcp_sdk.study import report as of_campaign
-    from evlcp_sdk.study.summary import beside_paper
+    from evlcp_sdk.study import report
+    from evlcp_sdk.study.summary import compare_with_paper
 
     tables: list[tuple[Sequence[str], Sequence[Sequence[str]], int]] = [
-        (*of_campaign.figure_rows(summary), 2),
-        (of_campaign.POSITION_HEAD, of_campaign.position_rows(summary), 1),
-        (of_campaign.PAPER_HEAD, of_campaign.comparison_rows(beside_paper(summary.series)), 3),
+        (*report.figure_rows(summary), 2),
+        (report.POSITION_HEAD, report.position_rows(summary), 1),
+        (report.PAPER_HEAD, report.paper_rows(compare_with_paper(summary.series)), 3),
     ]
     return [table for table in tables if table[1]]

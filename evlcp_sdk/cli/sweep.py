@@ -50,26 +50,26 @@ def sweep(
     from dataclasses import asdict
 
     from evlcp_sdk.errors import InterruptedRunError
-    from evlcp_sdk.study.collect import collect, progress_of
+    from evlcp_sdk.study.collect import collect_results, progress_of
     from evlcp_sdk.study.store import Store
-    from evlcp_sdk.study.task import plan_of, run_job
+    from evlcp_sdk.study.task import plan_campaign, run_job
 
-    plan = plan_of(campaign, overrides or [])
+    plan = plan_campaign(campaign, overrides or [])
     path = out or Path(f"{plan.name}.sqlite")
     if dry_run:
         kept = {}
         if path.exists():
             with Store(path) as store:
-                kept = store.results()
+                kept = store.read_results()
         progress = progress_of(plan, kept)
     else:
         executor = make_executor(workers, dask)
         with Store(path, create=True) as store:
             try:
                 with campaign_bar(plan.name) as show:
-                    progress = collect(plan, store, executor, run_job, show)
+                    progress = collect_results(plan, store, executor, run_job, show)
             except KeyboardInterrupt:
-                so_far = progress_of(plan, store.results())
+                so_far = progress_of(plan, store.read_results())
                 done = f"{so_far.done} of {so_far.tasks} tasks are in {path}"
                 raise InterruptedRunError(f"interrupted; {done}; the same command goes on") from None
     show_faults(progress)

@@ -1,6 +1,6 @@
-"""What was received beside what was sent.
+"""Comparison of what was received with what was sent.
 
-`frames` are matched with the truth by `match`, counted by `measure` into what adds up in `tally`; `score`,
+`match` pairs `frames` with the truth's, `measure` counts them into the addable sums of `tally`; `score`,
 `compare` and campaigns are views of that. `plan` reads a campaign into points and tasks, `task` runs one,
 `store` keeps what is finished, `collect` joins them over the executors of `jobs`, `summary` adds up, and
 `report` shows it.

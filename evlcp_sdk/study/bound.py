@@ -1,9 +1,9 @@
-"""The least errors that one frame can have: Cramer-Rao bounds.
+"""Cramer-Rao bounds: the least errors that a frame can have.
 
-They belong to the geometry of the problem and to no algorithm, so they stand here and not beside one: how
-sharply light shows in the image, how noisy its pixels are, and how far clusters lie apart bound whatever
-reads it. Pixels have Gaussian noise of one size (Kay, Estimation Theory, chapter 3). Of a bar, one even
-column of clusters, it is the boundaries between clusters that say where they lie.
+They depend on the geometry and not on an algorithm: the sharpness of light in the image, the noise of its
+pixels, and the spacing of clusters bound every decoder. Pixels have Gaussian noise of one size (Kay,
+Estimation Theory, chapter 3). In a bar that is one even column of clusters, the boundaries between clusters
+show where these lie.
 """
 
 import math
@@ -23,32 +23,32 @@ from evlcp_sdk.values import FrameView, PresenceMap, Range
 
 Array = NDArray[np.float64]
 
-_NONE = Range(math.nan, math.nan, 0)
+_NO_RANGE = Range(math.nan, math.nan, 0)
 
-_UNKNOWN = 1e-9
-"""Share of a parameter's own information below which what others leave of it is none."""
+_LEAST_INFORMATION = 1e-9
+"""Share of a parameter's own information below which the other parameters leave none."""
 
 _LEAST_GAIN = 0.01
-"""Share of a full value below which a fit has found no light: one event in some thirty values."""
+"""Gain below which a fit has found no light: one event in some thirty values."""
 
-_MOST_OFF = 0.2
-"""How far, as a share, a fit's scale may lie from that of the clusters' middles: not a fit beyond."""
+_MOST_SCALE_ERROR = 0.2
+"""Share by which a fit's scale may differ from that of the clusters' middles; beyond, it is no fit."""
 
-_MOVES_PX = 3.0
-"""How far a value's boundaries may lie from a steady motion before data must speak."""
+_MOTION_SIGMA_PX = 3.0
+"""Prior sigma of a value's deviation from steady motion."""
 
-_VEIL = 0.3
-"""Share of the brightest column's light that is a veil, or beside the bar."""
+_VEIL_SHARE = 0.3
+"""Share of the brightest column's light below which a column is veil or background."""
 
-_USUAL_PX, _USUALLY = 0.35, 0.5
-"""Width of a boundary by lens and pixel, and how far its log may lie from that before data must speak: where
-all boundaries lie between two pixels they say nothing of it."""
+_BLUR_PX, _LOG_BLUR_SIGMA = 0.35, 0.5
+"""Prior width of a boundary by lens and pixel, and sigma of its log: where all boundaries lie between two
+pixels, they do not show it."""
 
-_NOISE = 0.1
-"""Of a row's value, in full values, when that is weighed."""
+_PRIOR_NOISE = 0.1
+"""Noise of a row's value, in full values, that priors are weighed against."""
 
-_LEAST_FREE = 0.1
-"""Of a row's residual; a row that decides a parameter by itself shows nothing of the noise."""
+_LEAST_FREE_SHARE = 0.1
+"""Least share of a row's residual: a row that decides a parameter by itself does not show the noise."""
 
 _LEAST_BOUNDARIES = 3
 """Boundaries without which spacing, position and drift cannot be separated."""
@@ -67,11 +67,9 @@ def bar_bound(
 ) -> float:
     """Smallest standard deviation of a bar's distance by one frame, m; infinite where no pixel shows it.
 
-    Spacing, position, drift and gain are unknown.
-
-    A row of pixels at a boundary sees light of both clusters, in shares that follow a normal distribution;
-    each pixel's value is that mixture of their codes plus noise. Rows beyond the middles of the outermost
-    clusters, which have no neighbour, do not count.
+    Spacing, position, drift and gain are unknown. A row of pixels at a boundary sees light of both clusters,
+    in shares that follow a normal distribution; each pixel's value is that mixture of their codes plus noise.
+    Rows beyond the middles of the outermost clusters do not count.
 
     Args:
         link: For the camera, the bar and its codes; the bar is one even column of clusters.
@@ -84,7 +82,7 @@ def bar_bound(
         shift_px: Where the bar lies on the pixel grid, px.
 
     Raises:
-        ConfigError: A quantity that must be positive is not, or the bar is another layout.
+        ConfigError: A quantity that must be positive is not, or the bar has another layout.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> round(bar_bound(load_link(), 50.0, range(16), blur_px=0.45, noise=0.3), 4)
@@ -95,15 +93,15 @@ def bar_bound(
     if not spacing_m > 0:
         raise ConfigError("this Cramer-Rao bound needs one even column of two clusters or more")
     spacing = link.camera.focal_px * spacing_m / distance_m
-    codes = _codes(link.codebook, np.asarray(symbols, np.int64))
+    codes = _cluster_codes(link.codebook, np.asarray(symbols, np.int64))
     clusters, values = codes.shape
-    rows = _from_middle(2 * int(spacing * clusters / 2 + 4))
+    rows = _pixels_from_middle(2 * int(spacing * clusters / 2 + 4))
     fit = np.array([spacing, shift_px, 0.0, gain, np.log(blur_px), 0.0, 0.0, 0.0])
-    offset, when = np.zeros(values), _times(values)
-    nearest = _nearest(fit, clusters, rows, offset, when)
-    _, slopes = _model(fit, codes, nearest, rows, offset, when)
-    slopes = slopes[:4, _counts(nearest, np.ones(clusters, np.bool_))]
-    sigma_px = _sigmas(columns / noise**2 * (slopes @ slopes.T))[0]
+    offset, when = np.zeros(values), _value_times(values)
+    nearest = _nearest_boundaries(fit, clusters, rows, offset, when)
+    _, slopes = _boundary_model(fit, codes, nearest, rows, offset, when)
+    slopes = slopes[:4, _select_rows(nearest, np.ones(clusters, np.bool_))]
+    sigma_px = _parameter_sigmas(columns / noise**2 * (slopes @ slopes.T))[0]
     return float(distance_m * sigma_px / spacing)
 
 
@@ -113,82 +111,82 @@ def _check_positive(**quantities: float) -> None:
             raise ConfigError(f"{name} = {quantity}: expected a positive number")
 
 
-def _sigmas(information: Array) -> Array:
-    """Standard deviation of each parameter, the others unknown, too; infinite where nothing shows it."""
+def _parameter_sigmas(information: Array) -> Array:
+    """Standard deviation of each parameter, with the others unknown; infinite where nothing shows it."""
     own = np.sqrt(np.maximum(np.diag(information), 0.0))
-    known = own > 0
-    found = np.full(len(own), np.inf)
-    scaled = information[np.ix_(known, known)] / np.outer(own[known], own[known])
-    for i, k in enumerate(np.flatnonzero(known)):
+    shown = own > 0
+    sigmas = np.full(len(own), np.inf)
+    scaled = information[np.ix_(shown, shown)] / np.outer(own[shown], own[shown])
+    for i, k in enumerate(np.flatnonzero(shown)):
         others = np.delete(np.arange(len(scaled)), i)
         row = scaled[i, others]
-        left = 1.0 - row @ np.linalg.pinv(scaled[np.ix_(others, others)], rcond=_UNKNOWN) @ row
-        if left > _UNKNOWN:
-            found[k] = 1 / (own[k] * math.sqrt(left))
-    return found
+        remaining = 1.0 - row @ np.linalg.pinv(scaled[np.ix_(others, others)], rcond=_LEAST_INFORMATION) @ row
+        if remaining > _LEAST_INFORMATION:
+            sigmas[k] = 1 / (own[k] * math.sqrt(remaining))
+    return sigmas
 
 
-def _codes(codebook: Codebook, symbols: NDArray[np.int64]) -> Array:
-    """What each cluster sends in a frame, pilot and info, float64 (K, values)."""
+def _cluster_codes(codebook: Codebook, symbols: NDArray[np.int64]) -> Array:
+    """Codes that each cluster sends in a frame, pilot and info, float64 (K, values)."""
     sent = codebook.codeword_edges[symbols]
     return np.concatenate([codebook.pilot_edges, sent], axis=1).astype(np.float64)
 
 
 def frame_bound(link: Link, *, full_events: float = 3.0) -> Callable[[FrameView], Range]:
-    """A function that gives, as sigma, the bound of a frame.
+    """Make a function that estimates a frame's distance and, as its sigma, the frame's bound.
 
     Blur, gain and noise of the bound are those of the frame. Its values are fitted by the boundaries' model
     (least squares over spacing, position, drift, gain, blur, an offset between positive and negative events,
-    shifts by a step's sign and by values that repeat, and a motion of each value), and what is left over
-    is the noise. It is that of the rows that say where boundaries lie: each weighs with the square of its
-    slope, and with the leverage that the fit has on it. Neither truth nor any algorithm is needed. The noise
-    is taken as Gaussian and independent; an error that several frames share is not seen.
+    shifts by a step's sign and by repeated values, and a motion of each value), and the residual is the
+    noise: that of the rows that locate boundaries, each weighed with the square of its slope and its leverage
+    on the fit. Neither truth nor any algorithm is needed. The noise is taken as Gaussian and independent;
+    errors that frames share are not seen.
 
     Args:
         link: For the camera, the bar and its codes.
-        full_events: Events of a pixel in a chip that count as a full value; more are clipped, as hot pixels
-            send them.
+        full_events: Events of a pixel in a chip that count as a full value; more, as from hot pixels, are
+            clipped.
 
     Returns:
-        From what the receiver's stage `view` shows to the fit's distance and the bound, both NaN where the
-        frame shows too little.
+        A function of what the stage `view` shows; distance and sigma are NaN where the frame shows too
+        little.
 
     Raises:
         ConfigError: The layout is not one even column of three clusters or more.
     """
     if not (link.bar.column_pitch_m > 0 and link.bar.clusters > 2):
         raise ConfigError("the bound of a frame needs one even column of three clusters or more")
-    return partial(_bound_of_frame, link, full_events)
+    return partial(_compute_frame_bound, link, full_events)
 
 
-def _bound_of_frame(link: Link, full_events: float, view: FrameView) -> Range:
-    seen, middles = _middles(view.presence)
+def _compute_frame_bound(link: Link, full_events: float, view: FrameView) -> Range:
+    seen, middles = _find_middles(view.presence)
     if int((seen[1:] & seen[:-1]).sum()) < _LEAST_BOUNDARIES:
-        return _NONE
-    wide, high = np.ptp(middles[seen], axis=0)
-    upright = bool(high >= wide)
-    at_row = middles[:, 1 if upright else 0]
-    behind = link.codebook.edge_chips
-    sums, offset = view.sums[behind], (view.offset_px[:, behind - 1] + view.offset_px[:, behind]) / 2
+        return _NO_RANGE
+    width, height = np.ptp(middles[seen], axis=0)
+    is_upright = bool(height >= width)
+    positions = middles[:, 1 if is_upright else 0]
+    edges = link.codebook.edge_chips
+    sums, offset = view.sums[edges], (view.offset_px[:, edges - 1] + view.offset_px[:, edges]) / 2
     light = view.presence.pixels.sum(0)
-    if not upright:
-        # A bar that lies across the image: exchange rows and columns.
+    if not is_upright:
+        # A bar across the image: exchange rows and columns.
         sums, light, offset = sums.transpose(0, 2, 1), light.T, offset[::-1]
-    k = np.flatnonzero(seen)
-    tilt, left = _line(light)
-    spacing, first = theilslopes(at_row[k], k)[:2]
-    values, columns = _row_values(sums, light, tilt, left, full_events)
-    codes = _codes(link.codebook, view.soft.symbols)
-    rows, down = _from_middle(sums.shape[1]), offset[1]
+    clusters = np.flatnonzero(seen)
+    tilt, left = _fit_line(light)
+    spacing, first = theilslopes(positions[clusters], clusters)[:2]
+    values, columns = _average_rows(sums, light, tilt, left, full_events)
+    codes = _cluster_codes(link.codebook, view.soft.symbols)
+    rows, row_offset = _pixels_from_middle(sums.shape[1]), offset[1]
     centre = first + spacing * (len(codes) - 1) / 2 - (sums.shape[1] - 1) / 2
     if spacing < 0:
         # A bar upside down: mirror it.
-        values, down, spacing, centre = values[:, ::-1], -down, -spacing, -centre
-    start = np.array([spacing, centre, 0.0, 0.5, np.log(_USUAL_PX), 0.0, 0.0, 0.0])
-    found = _fit(start, codes, values, seen, rows, down, _times(len(values)))
-    if found is None:
-        return _NONE
-    fit, noise = found
+        values, row_offset, spacing, centre = values[:, ::-1], -row_offset, -spacing, -centre
+    start = np.array([spacing, centre, 0.0, 0.5, np.log(_BLUR_PX), 0.0, 0.0, 0.0])
+    solution = _fit_frame(start, codes, values, seen, rows, row_offset, _value_times(len(values)))
+    if solution is None:
+        return _NO_RANGE
+    fit, noise = solution
     distance_m = link.camera.distance_m(link.bar.column_pitch_m, float(fit[0]) * float(np.hypot(1.0, tilt)))
     sigma_m = bar_bound(
         link,
@@ -201,81 +199,82 @@ def _bound_of_frame(link: Link, full_events: float, view: FrameView) -> Range:
         shift_px=float(fit[1]),
     )
     pairs = int((seen[1:] & seen[:-1]).sum())
-    return Range(distance_m, sigma_m, pairs) if math.isfinite(sigma_m) else _NONE
+    return Range(distance_m, sigma_m, pairs) if math.isfinite(sigma_m) else _NO_RANGE
 
 
-def _row_values(
+def _average_rows(
     sums: NDArray[np.int16], light: NDArray[np.float32], tilt: float, left: float, full_events: float
 ) -> tuple[Array, float]:
-    """Mean of each row's clipped sums in the chips behind edges (edges, rows); columns of a row.
+    """Mean of each row's clipped sums in the chips behind edges (edges, rows); number of columns of a row.
 
-    Columns weigh by their light beyond the veil that a lens or a halo lays beside the bar.
+    Columns weigh by their light beyond the veil of a lens or a halo.
     """
     row, column = np.ogrid[: sums.shape[1], : sums.shape[2]]
-    beside = np.floor(column - (left + tilt * row) + 0.5).astype(np.int64)
-    beside -= beside.min()
-    many = np.maximum(np.bincount(beside.ravel()), 1)
-    lit = np.bincount(beside.ravel(), np.maximum(light, 0).ravel()) / many
-    weight = np.maximum(lit - _VEIL * lit.max(), 0.0)[beside]
+    columns_off = np.floor(column - (left + tilt * row) + 0.5).astype(np.int64)
+    columns_off -= columns_off.min()
+    counts = np.maximum(np.bincount(columns_off.ravel()), 1)
+    brightness = np.bincount(columns_off.ravel(), np.maximum(light, 0).ravel()) / counts
+    weight = np.maximum(brightness - _VEIL_SHARE * brightness.max(), 0.0)[columns_off]
     clipped: Array = np.clip(sums.astype(np.float64) / full_events, -1.0, 1.0)
     total = np.maximum(weight.sum(1), 1e-12)
     values: Array = (weight * clipped).sum(2) / total
     return values, float(np.median(total**2 / np.maximum((weight**2).sum(1), 1e-12)))
 
 
-def _from_middle(pixels: int) -> Array:
-    """Pixels from the image's middle, px."""
+def _pixels_from_middle(pixels: int) -> Array:
+    """Pixel coordinates from the image's middle, px."""
     return np.arange(pixels, dtype=np.float64) - (pixels - 1) / 2
 
 
-def _times(values: int) -> Array:
-    """Times of the values, from the frame's middle, in frames."""
+def _value_times(values: int) -> Array:
+    """Times of the values from the frame's middle, in frames."""
     return np.arange(values, dtype=np.float64) / values - 0.5
 
 
-def _nearest(fit: Array, clusters: int, rows: Array, offset: Array, when: Array) -> NDArray[np.int64]:
+def _nearest_boundaries(
+    fit: Array, clusters: int, rows: Array, offset: Array, when: Array
+) -> NDArray[np.int64]:
     """The boundary that each row is nearest to in each value, int64 (values, rows); 0 and K are the ends."""
     place = (rows - (offset + fit[1] + fit[2] * when)[:, None]) / fit[0] + clusters / 2
     nearest: NDArray[np.int64] = np.clip(np.floor(place + 0.5), 0, clusters).astype(np.int64)
     return nearest
 
 
-def _counts(nearest: NDArray[np.int64], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Rows that count: at a boundary between two clusters that are seen, bool (values, rows)."""
-    known = np.zeros(len(seen) + 1, np.bool_)
-    known[1:-1] = seen[1:] & seen[:-1]
-    return known[nearest]
+def _select_rows(nearest: NDArray[np.int64], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Select rows at a boundary between two clusters that are seen, bool (values, rows)."""
+    usable = np.zeros(len(seen) + 1, np.bool_)
+    usable[1:-1] = seen[1:] & seen[:-1]
+    return usable[nearest]
 
 
-def _model(
+def _boundary_model(
     fit: Array, codes: Array, nearest: NDArray[np.int64], rows: Array, offset: Array, when: Array
 ) -> tuple[Array, Array]:
     """Expected values (values, rows), and their slopes by `fit` (8, values, rows).
 
     `fit` is spacing, centre, drift, gain, log of the blur, offset of the values, shift by sign and by repeat;
     boundary b between clusters b - 1 and b of K lies at spacing * (b - K / 2) from a centre that moves by
-    drift within the frame, shifted to one side where it steps up and to the other where it steps down, and
-    into a cluster that repeats its last value.
+    drift within the frame, shifted by the sign of its step, and into a cluster that repeats its last value.
     """
     clusters = len(codes)
-    b = np.clip(nearest, 1, clusters - 1)
-    apart = b - clusters / 2
+    boundary = np.clip(nearest, 1, clusters - 1)
+    index = boundary - clusters / 2
     value = np.arange(codes.shape[1])[:, None]
-    step = codes[b, value] - codes[b - 1, value]
+    step = codes[boundary, value] - codes[boundary - 1, value]
     sign = np.sign(step)
     repeats = np.zeros(codes.shape)
     repeats[:, 1:] = codes[:, 1:] == codes[:, :-1]
-    again = repeats[b - 1, value] - repeats[b, value]
-    shift = fit[6] * sign + fit[7] * again
+    repeat = repeats[boundary - 1, value] - repeats[boundary, value]
+    shift = fit[6] * sign + fit[7] * repeat
     width = np.exp(fit[4])
-    z = (rows - (offset + fit[1] + fit[2] * when)[:, None] - fit[0] * apart - shift) / width
-    level = codes[b - 1, value] + step * ndtr(z)
-    steep = fit[3] * step * np.exp(-z * z / 2) / np.sqrt(2 * np.pi) / width
-    slopes = [-steep * apart, -steep, -steep * when[:, None], level, -steep * z * width, np.ones_like(level)]
-    return fit[3] * level + fit[5], np.stack([*slopes, -steep * sign, -steep * again])
+    z = (rows - (offset + fit[1] + fit[2] * when)[:, None] - fit[0] * index - shift) / width
+    level = codes[boundary - 1, value] + step * ndtr(z)
+    flank = fit[3] * step * np.exp(-z * z / 2) / np.sqrt(2 * np.pi) / width
+    slopes = [-flank * index, -flank, -flank * when[:, None], level, -flank * z * width, np.ones_like(level)]
+    return fit[3] * level + fit[5], np.stack([*slopes, -flank * sign, -flank * repeat])
 
 
-def _fit(
+def _fit_frame(
     start: Array,
     codes: Array,
     values: Array,
@@ -284,51 +283,51 @@ def _fit(
     offset: Array,
     when: Array,
 ) -> tuple[Array, float] | None:
-    """The model that fits the values best, and the standard deviation of what is left; None without one."""
-    # Rows keep their boundary while the fit moves: those that might change it are far from any.
-    nearest = _nearest(start, len(codes), rows, offset, when)
-    counts = _counts(nearest, seen)
-    values_of_row = np.nonzero(counts)[0]
-    known = len(start)
-    if counts.sum() <= known + len(when):
+    """Fit the model to the values; return it and the noise of the residuals, or None without a fit."""
+    # Rows keep their boundary during the fit: those that might change it are far from any.
+    nearest = _nearest_boundaries(start, len(codes), rows, offset, when)
+    used = _select_rows(nearest, seen)
+    values_of_row = np.nonzero(used)[0]
+    size = len(start)
+    if used.sum() <= size + len(when):
         return None
 
-    # What is likely beforehand, as further rows.
-    usual = np.zeros(known + len(when))
-    usual[4] = np.log(_USUAL_PX)
-    prior = np.zeros(known + len(when))
-    prior[4], prior[known:] = _NOISE / _USUALLY, _NOISE / _MOVES_PX
+    # Priors, as further rows.
+    prior_mean = np.zeros(size + len(when))
+    prior_mean[4] = np.log(_BLUR_PX)
+    prior_weight = np.zeros(size + len(when))
+    prior_weight[4], prior_weight[size:] = _PRIOR_NOISE / _LOG_BLUR_SIGMA, _PRIOR_NOISE / _MOTION_SIGMA_PX
 
     def residuals(fit: Array) -> Array:
-        fitted = _model(fit[:known], codes, nearest, rows, offset + fit[known:], when)[0]
-        return np.concatenate([(fitted - values)[counts], prior * (fit - usual)])
+        fitted = _boundary_model(fit[:size], codes, nearest, rows, offset + fit[size:], when)[0]
+        return np.concatenate([(fitted - values)[used], prior_weight * (fit - prior_mean)])
 
     def slopes(fit: Array) -> Array:
-        by = _model(fit[:known], codes, nearest, rows, offset + fit[known:], when)[1][:, counts].T
-        own = np.where(values_of_row[:, None] == np.arange(len(when)), by[:, 1:2], 0.0)
-        return np.vstack([np.hstack([by, own]), np.diag(prior)])
+        jacobian = _boundary_model(fit[:size], codes, nearest, rows, offset + fit[size:], when)[1][:, used].T
+        by_motion = np.where(values_of_row[:, None] == np.arange(len(when)), jacobian[:, 1:2], 0.0)
+        return np.vstack([np.hstack([jacobian, by_motion]), np.diag(prior_weight)])
 
     scale = np.concatenate([[0.1, 1, 1, 1, 0.3, 1, 0.1, 0.1], np.full(len(when), 0.1)])
-    begin = np.concatenate([start, np.zeros(len(when))])
-    found = least_squares(residuals, begin, slopes, method="lm", x_scale=scale)
-    spacing, blur = found.x[0], np.exp(found.x[4])
-    seen_well = found.x[3] > _LEAST_GAIN and blur < spacing and abs(spacing / start[0] - 1) < _MOST_OFF
-    if not (found.success and seen_well):
+    start_fit = np.concatenate([start, np.zeros(len(when))])
+    solution = least_squares(residuals, start_fit, slopes, method="lm", x_scale=scale)
+    spacing, blur = solution.x[0], np.exp(solution.x[4])
+    scales = abs(spacing / start[0] - 1) < _MOST_SCALE_ERROR
+    if not (solution.success and solution.x[3] > _LEAST_GAIN and blur < spacing and scales):
         return None
-    many = int(counts.sum())
-    by = slopes(found.x)
-    # What a fit leaves over is smaller where it follows: by its leverage.
-    leverage = (np.linalg.qr(by)[0] ** 2).sum(1)[:many]
-    left = found.fun[:many] ** 2 / np.maximum(1 - leverage, _LEAST_FREE)
-    weight = by[:many, 0] ** 2
-    variance = float((weight * left).sum() / max(float(weight.sum()), 1e-300))
+    count = int(used.sum())
+    jacobian = slopes(solution.x)
+    # Residuals are smaller by the rows' leverage on the fit.
+    leverage = (np.linalg.qr(jacobian)[0] ** 2).sum(1)[:count]
+    squares = solution.fun[:count] ** 2 / np.maximum(1 - leverage, _LEAST_FREE_SHARE)
+    weight = jacobian[:count, 0] ** 2
+    variance = float((weight * squares).sum() / max(float(weight.sum()), 1e-300))
     if not variance > 0:
         return None
-    return found.x[:known], float(np.sqrt(variance))
+    return solution.x[:size], float(np.sqrt(variance))
 
 
-def _middles(presence: PresenceMap) -> tuple[NDArray[np.bool_], Array]:
-    """Which clusters are seen, bool (K,), and their middles, column and row, px, float64 (K, 2)."""
+def _find_middles(presence: PresenceMap) -> tuple[NDArray[np.bool_], Array]:
+    """Find the clusters that are seen, bool (K,), and their middles, column and row, px, float64 (K, 2)."""
     seen: NDArray[np.bool_] = np.any(presence.selected, axis=(1, 2))
     grid = presence.grid_px
     middles = np.zeros((len(seen), 2))
@@ -338,8 +337,8 @@ def _middles(presence: PresenceMap) -> tuple[NDArray[np.bool_], Array]:
     return seen, middles
 
 
-def _line(light: NDArray[np.float32]) -> tuple[float, float]:
-    """Slope and intercept of the bar's line, column over row, by least squares weighted with the light."""
+def _fit_line(light: NDArray[np.float32]) -> tuple[float, float]:
+    """Fit the bar's line, column over row, weighted with the light: slope and intercept."""
     weight = np.maximum(light, 0).astype(np.float64)
     row, column = np.indices(weight.shape)
     total = weight.sum()

@@ -1,4 +1,6 @@
-"""The collection: which tasks are still needed, and the loop that runs them and keeps their results."""
+"""Collection of a campaign's results: the tasks still needed, and the loop that runs them and keeps their
+results.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -10,15 +12,15 @@ from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import Statistics, Tally
 
 RunJob = Callable[[Job], Sequence[tuple[str, Statistics]]]
-"""Runs a job; gives the statistics of each of its tasks."""
+"""Runs a job and returns the statistics of each of its tasks."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a collection is.
+    """Progress of a collection.
 
     Attributes:
-        tasks: Tasks that count or may still: all, less those that a stopping rule made needless.
+        tasks: Tasks that count or may still: all but those that a stopping rule made needless.
         done: Those of them that are finished.
         points_done: Points of the plan that need no more tasks.
         bits: Bits that count so far; wrong ones among them: `bit_errors`.
@@ -35,20 +37,20 @@ class Progress:
 
 
 @dataclass
-class Counted:
-    """What counts of a point: its seeds in order, up to the one that reaches the stopping rule.
+class PointProgress:
+    """The seeds of a point that count: in order, up to the one that reaches the stopping rule.
 
-    Tasks run out of order and beyond that seed; what those gave does not count, so the answer is the same
-    however many workers there were.
+    Results of later seeds, which run out of order, do not count, so that the outcome is the same for any
+    number of workers.
 
     Args:
         tasks: The point's tasks, by seed.
         rule: When it has enough.
-        results: Task id to statistics; `advance` looks what has come.
+        results: Task id to statistics; `advance` takes new ones.
 
     Attributes:
         tally: The tally so far, of all segments.
-        seeds: How many seeds it takes.
+        seeds: How many seeds count so far.
         complete: No more seeds are needed.
         found: How many of its tasks have results.
     """
@@ -65,10 +67,10 @@ class Counted:
         self.advance(sum(task in self.results for task in self.tasks))
 
     def advance(self, found: int) -> None:
-        """Count results that have come since, so many of them."""
+        """Take in results that were added, so many."""
         self.found += found
         while not self.complete:
-            if self.seeds == len(self.tasks) or self.rule.reached(self.tally):
+            if self.seeds == len(self.tasks) or self.rule.is_reached(self.tally):
                 self.complete = True
             elif (result := self.results.get(self.tasks[self.seeds])) is not None:
                 self.tally += result.total()
@@ -78,7 +80,7 @@ class Counted:
 
     @property
     def recordings(self) -> tuple[Statistics, ...]:
-        """What counts of each seed, in order."""
+        """Statistics of each seed that counts, in order."""
         return tuple(self.results[task] for task in self.tasks[: self.seeds])
 
     @property
@@ -88,66 +90,66 @@ class Counted:
 
     @property
     def done(self) -> int:
-        """Those of them that are finished."""
+        """Number of those that are finished."""
         return self.seeds if self.complete else self.found
 
 
-def collect(
+def collect_results(
     plan: Plan,
     store: Store,
     executor: Executor,
     run: RunJob,
-    watch: Callable[[Progress], None] = lambda _: None,
+    report_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Progress:
-    """Run what a campaign still needs, and keep every result as it comes.
+    """Run the tasks that a campaign still needs, and keep every result as it comes.
 
     Returns:
-        How far it came; its `faults` say which jobs failed. They are tried again by the next run.
+        The progress; its `faults` are of jobs that failed, which the next run tries again.
 
     Raises:
         EvlcpError: The store cannot be written, or the executor cannot go on; what was finished is kept.
     """
-    store.adopt(plan)
-    results = store.results()
-    points = [Counted(point.tasks, plan.rule, results) for point in plan.points]
-    points_of: dict[str, list[Counted]] = {}
+    store.save_plan(plan)
+    results = store.read_results()
+    points = [PointProgress(point.tasks, plan.rule, results) for point in plan.points]
+    points_of: dict[str, list[PointProgress]] = {}
     for point in points:
         for task in point.tasks:
             points_of.setdefault(task, []).append(point)
-    begun: set[str] = set()
+    started: set[str] = set()
     faults: list[tuple[Job, Fault]] = []
 
-    def needed() -> Iterator[Job]:
-        """Jobs in order of their seed; each task is looked at again before it is given out."""
+    def needed_jobs() -> Iterator[Job]:
+        """Jobs in order of their seed; each task is checked again before it is started."""
         for job in plan.jobs:
             tasks = tuple(
                 task
                 for task in job.tasks
                 if task.id not in results
-                and task.id not in begun
+                and task.id not in started
                 and not all(point.complete for point in points_of[task.id])
             )
             if tasks:
-                begun.update(task.id for task in tasks)
+                started.update(task.id for task in tasks)
                 yield replace(job, tasks=tasks)
 
-    watch(_progress(points, faults))
-    with closing(executor.run(run, needed())) as outcomes:
+    report_progress(_sum_progress(points, faults))
+    with closing(executor.run(run, needed_jobs())) as outcomes:
         for outcome in outcomes:
             if outcome.fault is not None:
                 faults.append((outcome.job, outcome.fault))
             else:
                 found = list(outcome.value or ())
-                store.put(found)
+                store.save_results(found)
                 results.update(found)
                 for task, _ in found:
                     for point in points_of[task]:
                         point.advance(1)
-            watch(_progress(points, faults))
-    return _progress(points, faults)
+            report_progress(_sum_progress(points, faults))
+    return _sum_progress(points, faults)
 
 
-def _progress(points: Sequence[Counted], faults: Sequence[tuple[Job, Fault]] = ()) -> Progress:
+def _sum_progress(points: Sequence[PointProgress], faults: Sequence[tuple[Job, Fault]] = ()) -> Progress:
     return Progress(
         tasks=sum(point.needed for point in points),
         done=sum(point.done for point in points),
@@ -160,5 +162,5 @@ def _progress(points: Sequence[Counted], faults: Sequence[tuple[Job, Fault]] = (
 
 
 def progress_of(plan: Plan, results: Mapping[str, Statistics]) -> Progress:
-    """How far a campaign is with these results."""
-    return _progress([Counted(point.tasks, plan.rule, results) for point in plan.points])
+    """Progress of a campaign with these results."""
+    return _sum_progress([PointProgress(point.tasks, plan.rule, results) for point in plan.points])

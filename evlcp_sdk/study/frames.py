@@ -1,4 +1,4 @@
-"""Decoded frames as far as they are scored: from a receiver's packets, or read back from `frames.csv`."""
+"""Decoded frames for scoring: from a receiver's packets, or read from `frames.csv`."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -17,7 +17,7 @@ class FrameRow:
 
     Attributes:
         symbols: Symbol of each cluster, cluster 0 first; -1 for one that is not given.
-        distance_m: Distance along the optical axis, m; as its sigma, and as filtered, NaN for none.
+        distance_m: Distance along the optical axis, m; NaN for none, as its sigma and the filtered one.
     """
 
     transmitter: int
@@ -33,7 +33,7 @@ class FrameRow:
 
 
 def frames_of(packets: Iterable[Packet]) -> list[FrameRow]:
-    """What is scored of packets, in order."""
+    """Rows of the packets' frames, in order."""
     return [
         FrameRow(
             transmitter=frame.transmitter,
@@ -58,14 +58,14 @@ _NEEDED = ("transmitter", "t_us", "symbols", "distance_m", "x_px", "y_px")
 
 
 def read_frames(folder: Path | str) -> list[FrameRow]:
-    """The rows of a result's `frames.csv`.
+    """Read the rows of a result's `frames.csv`.
 
     Needed are the columns transmitter, t_us, symbols, distance_m, x_px and y_px; distance_sigma_m,
-    distance_filtered_m, echo_of and link are read where they are there.
+    distance_filtered_m, echo_of and link are optional.
 
     Raises:
-        InputError: It is not there, it is not the file that `summary.json` beside it speaks of, a column is
-            missing, or a value is not a number; with file and line.
+        InputError: It is missing, it is not the file of the `summary.json` beside it, a column is missing, or
+            a value is not a number; with file and line.
     """
     path = Path(folder) / FRAMES
     summary = read_summary(folder)
@@ -82,11 +82,11 @@ def read_frames(folder: Path | str) -> list[FrameRow]:
 
 
 def _row(path: Path, line: int, row: Mapping[str, str | None]) -> FrameRow:
-    def number(name: str, *, may_lack: bool = False) -> float:
+    def number(name: str, *, optional: bool = False) -> float:
         text = row.get(name)
-        return math.nan if may_lack and not text else parse_csv_number(path, line, name, text)
+        return math.nan if optional and not text else parse_csv_number(path, line, name, text)
 
-    def whole(name: str, text: str | None) -> int:
+    def integer(name: str, text: str | None) -> int:
         try:
             return int(text or "")
         except ValueError:
@@ -95,14 +95,14 @@ def _row(path: Path, line: int, row: Mapping[str, str | None]) -> FrameRow:
 
     echo = row.get("echo_of")
     return FrameRow(
-        transmitter=whole("transmitter", row["transmitter"]),
+        transmitter=integer("transmitter", row["transmitter"]),
         t_us=number("t_us"),
-        symbols=tuple(-1 if s == "-" else whole("symbols", s) for s in (row["symbols"] or "").split()),
-        distance_m=number("distance_m", may_lack=True),
-        sigma_m=number("distance_sigma_m", may_lack=True),
-        filtered_m=number("distance_filtered_m", may_lack=True),
+        symbols=tuple(-1 if s == "-" else integer("symbols", s) for s in (row["symbols"] or "").split()),
+        distance_m=number("distance_m", optional=True),
+        sigma_m=number("distance_sigma_m", optional=True),
+        filtered_m=number("distance_filtered_m", optional=True),
         x_px=number("x_px"),
         y_px=number("y_px"),
-        echo_of=whole("echo_of", echo) if echo else None,
+        echo_of=integer("echo_of", echo) if echo else None,
         link=row.get("link") or "",
     )

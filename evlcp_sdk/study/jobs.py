@@ -1,8 +1,8 @@
-"""Jobs in this process, in processes of this machine, or on a Dask cluster; which may die without them.
+"""Executors of jobs: in this process, in processes of this machine, or on a Dask cluster; workers may die.
 
-An executor draws jobs only when it has room for one, so the drawer may decide late; outcomes come as they
-are ready, in any order. The module imports nothing heavy: a fresh process sets its number of threads before
-it meets the function's imports.
+An executor draws a job only when it has room for one, so that the generator of jobs may decide late; outcomes
+come as they are ready, in any order. The module imports nothing heavy: a fresh process sets its number of
+threads before it imports the function's modules.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ J = TypeVar("J")
 R = TypeVar("R")
 
 _ATTEMPTS = 3
-"""How often a job is started whose worker dies, before it counts as failed."""
+"""How often a job is started whose worker dies, before it has failed."""
 
 _CONNECT_S = 10
 _WORKERS_S = 60
@@ -37,7 +37,7 @@ _WAITING_PER_THREAD = 2
 
 @dataclass(frozen=True)
 class Fault:
-    """Why a job has no value, a line a fault, and what the command line would end with."""
+    """Why a job has no value, a line a fault, and the exit code of a command for it."""
 
     message: str
     exit_code: int = 1
@@ -45,7 +45,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Outcome(Generic[J, R]):
-    """How a job ended: with a value or a fault."""
+    """The outcome of a job: a value or a fault."""
 
     job: J
     value: R | None = None
@@ -56,12 +56,12 @@ class Inline:
     """Runs jobs one after the other in this process."""
 
     def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
-        """Run the function over the jobs; `jobs` is drawn from only when there is room for one.
+        """Run the function over the jobs, drawn only when there is room for one.
 
-        Function, jobs and values can be pickled. Who leaves before the end closes it, which ends what runs.
+        Function, jobs and values can be pickled. Closing the generator before its end stops what runs.
         """
         for job in jobs:
-            yield _attempt(function, job)
+            yield _run_job(function, job)
 
 
 class Processes:
@@ -84,41 +84,41 @@ class Processes:
         from concurrent.futures.process import BrokenProcessPool
 
         spawn = multiprocessing.get_context("spawn")
-        leash, held = spawn.Pipe()
-        # A pool is one process, so that its death is of one job.
-        make_pool = partial(ProcessPoolExecutor, 1, spawn, _begin, (held,))
+        own_end, workers_end = spawn.Pipe()
+        # A pool is one process, so that its death concerns one job.
+        make_pool = partial(ProcessPoolExecutor, 1, spawn, _prepare_worker, (workers_end,))
         pools: dict[Future[Any], ProcessPoolExecutor] = {}
 
         def start(job: J) -> Future[Any]:
             idle = next((future for future in pools if future.done()), None)
-            # A terminal that closes is the parent's business, not that of what it starts.
+            # A terminal that closes concerns the parent, not its children.
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
             try:
                 pool = make_pool() if idle is None else pools.pop(idle)
-                future = pool.submit(_attempt, function, job)
+                future = pool.submit(_run_job, function, job)
             except BrokenProcessPool:
-                # It died with its job, or since.
+                # The process has died.
                 pool = make_pool()
-                future = pool.submit(_attempt, function, job)
+                future = pool.submit(_run_job, function, job)
             finally:
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})
             pools[future] = pool
             return future
 
         try:
-            yield from _run(start, lambda: self._workers, BrokenProcessPool, jobs)
+            yield from _run_jobs(start, lambda: self._workers, BrokenProcessPool, jobs)
         finally:
-            leash.close()
+            own_end.close()
             for pool in pools.values():
                 pool.shutdown(cancel_futures=True)
-            held.close()
+            workers_end.close()
 
 
 class DaskCluster:
-    """Runs jobs on the workers of a Dask scheduler, as `Processes` does on this machine's; needs `cluster`.
+    """Runs jobs on the workers of a Dask scheduler; needs the extra `cluster`.
 
-    Workers may come, go and die while it runs: a job is started again on another, at most three times in all.
-    Only as many jobs are handed over as keep the workers busy.
+    Workers may come, go and die meanwhile: a job is started again on another, at most three times in all.
+    Only as many jobs are submitted as keep the workers busy.
 
     Args:
         address: Of the scheduler, e.g. `tcp://10.0.0.1:8786`.
@@ -138,7 +138,7 @@ class DaskCluster:
         self._address = address
         self._died: type[Exception] = distributed.scheduler.KilledWorker
         try:
-            # A client of an address that cannot be one takes 20 s to close, with a traceback.
+            # A client with an invalid address takes 20 s to close, with a traceback.
             distributed.comm.get_address_host_port(address)
             self._client: Any = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError, ImportError) as fault:
@@ -151,13 +151,13 @@ class DaskCluster:
         client = self._client
         pool = client.get_executor(pure=False, retries=0)
 
-        def room() -> int:
+        def slots() -> int:
             threads: int = sum(client.nthreads().values())
             return _WAITING_PER_THREAD * max(threads, 1)
 
         try:
             client.wait_for_workers(1, timeout=_WORKERS_S)
-            yield from _run(lambda job: pool.submit(_attempt, function, job), room, self._died, jobs)
+            yield from _run_jobs(lambda job: pool.submit(_run_job, function, job), slots, self._died, jobs)
         except TimeoutError as fault:
             text = f"--dask {self._address}: no worker came within {_WORKERS_S} s"
             raise EvlcpError(text) from fault
@@ -176,7 +176,7 @@ Executor = Inline | Processes | DaskCluster
 
 
 def stop_workers() -> None:
-    """Ask the jobs that run in processes of this one to stop, as a terminal's Ctrl-C does."""
+    """Interrupt the jobs in child processes, as a terminal's Ctrl-C does."""
     import multiprocessing
 
     for process in multiprocessing.active_children():
@@ -186,29 +186,29 @@ def stop_workers() -> None:
                 os.kill(process.pid, signal.SIGINT)
 
 
-def _attempt(function: Callable[[J], R], job: J) -> Outcome[J, R]:
-    """Run one job; whatever it raises becomes a fault."""
+def _run_job(function: Callable[[J], R], job: J) -> Outcome[J, R]:
+    """Run one job; an exception becomes a fault."""
     try:
         return Outcome(job, function(job))
     except (Exception, SystemExit) as fault:
         return Outcome(job, fault=Fault(*explain_fault(fault)))
 
 
-def _run(
-    start: Callable[[J], Future[Any]], room: Callable[[], int], died: type[Exception], jobs: Iterable[J]
+def _run_jobs(
+    start: Callable[[J], Future[Any]], slots: Callable[[], int], died: type[Exception], jobs: Iterable[J]
 ) -> Generator[Outcome[J, Any], None, None]:
-    """Keep as many jobs under way as there is room for; one whose worker dies is started again."""
+    """Keep as many jobs running as there are slots; restart one whose worker dies."""
     from concurrent.futures import FIRST_COMPLETED, wait
 
     source = ((job, 1) for job in jobs)
-    again: deque[tuple[J, int]] = deque()
+    retries: deque[tuple[J, int]] = deque()
     running: dict[Future[Any], tuple[J, int]] = {}
     while True:
-        for _ in range(room() - len(running)):
-            begun = again.popleft() if again else next(source, None)
-            if begun is None:
+        for _ in range(slots() - len(running)):
+            next_job = retries.popleft() if retries else next(source, None)
+            if next_job is None:
                 break
-            running[start(begun[0])] = begun
+            running[start(next_job[0])] = next_job
         if not running:
             return
         for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -217,22 +217,22 @@ def _run(
                 outcome = future.result()
             except died:
                 if attempt < _ATTEMPTS:
-                    again.append((job, attempt + 1))
+                    retries.append((job, attempt + 1))
                     continue
                 outcome = Outcome(job, fault=Fault(f"its process died {_ATTEMPTS} times"))
-            # The job as it was given, not its copy.
+            # The original job, not its copy.
             yield Outcome(job, outcome.value, outcome.fault)
 
 
-def _begin(held: Connection) -> None:
-    """Prepare a worker process: it ends when the other end of a pipe is closed, by hand or by death."""
-    # So is a terminal's Ctrl-C.
+def _prepare_worker(pipe: Connection) -> None:
+    """Prepare a worker process, which ends when the parent's end of the pipe is closed, also by its death."""
+    # Ctrl-C is for the parent.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 
-    def end() -> None:
+    def exit_with_parent() -> None:
         with suppress(EOFError, OSError):
-            held.recv()
+            pipe.recv()
         os._exit(1)
 
-    Thread(target=end, daemon=True).start()
+    Thread(target=exit_with_parent, daemon=True).start()

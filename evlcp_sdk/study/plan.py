@@ -1,8 +1,8 @@
 """The plan of a campaign: from `campaign.toml` to points, tasks and jobs.
 
 A point is one scene with one link; its tasks are its seeds. A task's id is the SHA-256 of everything that
-determines its result, so a result is found again whatever file asks for it. A job is what one worker does at
-once: a scene, rendered once, and all links that receive this rendering.
+determines its result, so that a result is found again from any file. A job is done by one worker: a scene,
+rendered once, and all links that receive this rendering.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ from evlcp_sdk.study.tally import Tally
 
 @dataclass(frozen=True)
 class StopRule:
-    """When a point has enough; None for never.
+    """When a point needs no more seeds; None for never.
 
     Attributes:
         max_bits: Bits received.
@@ -34,10 +34,10 @@ class StopRule:
     max_bits: Annotated[int | None, Field(ge=0, lt=2**63)] = None
     max_errors: Annotated[int | None, Field(ge=0, lt=2**63)] = None
 
-    def reached(self, tally: Tally) -> bool:
+    def is_reached(self, tally: Tally) -> bool:
         """Whether this is enough.
 
-        >>> StopRule(max_errors=0).reached(Tally())
+        >>> StopRule(max_errors=0).is_reached(Tally())
         True
         """
         enough_bits = self.max_bits is not None and tally.bits >= self.max_bits
@@ -49,11 +49,11 @@ class Case:
     """A scene or a link of the grid.
 
     Attributes:
-        labels: What sets it apart from the others: everything that the campaign varies.
-        value: What a worker needs of it; can be pickled, and is not kept.
+        labels: Its values of everything that the campaign varies.
+        value: What a worker needs of it; can be pickled, and is not stored.
         identity: Everything about it that determines a result, as JSON values.
-        group: Of scenes, what is seen of them: those with the same have one rendering; None: no two of them.
-            Of links, what is on air: those with the same receive the same rendering.
+        group: Scenes with the same group look the same and share a rendering, None: no two of them; links
+            with the same group send the same.
     """
 
     labels: dict[str, Any] = field(default_factory=dict)
@@ -62,13 +62,13 @@ class Case:
     group: Any = None
 
     def to_dict(self) -> dict[str, Any]:
-        """What is kept of it, as for JSON."""
+        """Its stored part, as for JSON."""
         return {"labels": self.labels, "identity": self.identity}
 
 
 @dataclass(frozen=True)
 class Task:
-    """One seed of one point: its id and, as `Case.value` has them, its scene and link."""
+    """One seed of one point: its id, and the values of its scene and link."""
 
     id: str
     scene: Any
@@ -77,7 +77,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Job:
-    """A scene, the first one of those that look the same, with a seed, and what receives its rendering."""
+    """A scene, the first of those that look the same, with a seed, and the tasks that receive it."""
 
     scene: Any
     seed: int
@@ -103,7 +103,7 @@ class Plan:
     """A whole campaign: every scene with every link and every seed.
 
     Attributes:
-        rule: When a point has enough.
+        rule: When a point needs no more seeds.
         merge: Labels over which a report adds points up.
         environment: Code and versions that the results come from.
     """
@@ -135,34 +135,34 @@ class Plan:
 
     @cached_property
     def jobs(self) -> tuple[Job, ...]:
-        """What there is to do: the first seed of every rendering, then the second, and so on."""
-        alike: dict[Any, list[Point]] = {}
+        """All jobs: the first seed of every rendering, then the second, and so on."""
+        groups: dict[Any, list[Point]] = {}
         for number, point in enumerate(self.points):
-            alone = ("", number // len(self.links))
-            seen = alone if point.scene.group is None else point.scene.group
-            alike.setdefault((seen, point.link.group), []).append(point)
+            own_group = ("", number // len(self.links))
+            group = own_group if point.scene.group is None else point.scene.group
+            groups.setdefault((group, point.link.group), []).append(point)
         jobs = []
-        for (n, seed), points in itertools.product(enumerate(self.seeds), alike.values()):
+        for (n, seed), points in itertools.product(enumerate(self.seeds), groups.values()):
             # Scenes or links that differ in name only are one task.
-            once = {p.tasks[n]: Task(p.tasks[n], p.scene.value, p.link.value) for p in points}
-            jobs.append(Job(points[0].scene.value, seed, tuple(once.values()), self.environment))
+            tasks = {p.tasks[n]: Task(p.tasks[n], p.scene.value, p.link.value) for p in points}
+            jobs.append(Job(points[0].scene.value, seed, tuple(tasks.values()), self.environment))
         return tuple(jobs)
 
     def to_dict(self) -> dict[str, Any]:
-        """What is kept of it, as for JSON."""
+        """Its stored part, as for JSON."""
         cases = {key: [case.to_dict() for case in getattr(self, key)] for key in ("scenes", "links")}
         return {f.name: getattr(self, f.name) for f in fields(self)} | {"rule": asdict(self.rule)} | cases
 
 
 def plan_from_dict(table: Any) -> Plan:
-    """What `Plan.to_dict` gave, also as JSON gives it back; it has no values, so no jobs can be run.
+    """A plan from `Plan.to_dict`, also by way of JSON; without values, so that its jobs cannot be run.
 
     Raises:
         ConfigError: It is something else.
     """
     if not isinstance(table, dict):
         raise ConfigError("expected a table")
-    # What is shown and hashed as it is, is of finite numbers.
+    # Refuses numbers that are not finite.
     digest_of(table)
     return build_spec(Plan, table)
 
@@ -179,7 +179,7 @@ def digest_of(value: Any) -> str:
 
 @dataclass(frozen=True)
 class _Campaign:
-    # Words of letters, digits, dots and dashes: a campaign names files.
+    # Words of letters, digits, dots and dashes: files are named by it.
     name: Annotated[str, Field(pattern=r"^[\w.-]+( [\w.-]+)*$", max_length=200)]
     seeds: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     first_seed: Annotated[int, Field(ge=0)] = 0
@@ -205,10 +205,10 @@ class _File:
 
 _MOST_CASES = 10_000
 _MOST_TASKS = 1_000_000
-"""A task simulates for a second or more; a campaign of more would end in weeks."""
+"""A task takes a second or more; a larger campaign would end in weeks."""
 
 MakeCase = Callable[[str | None, Sequence[str]], Case]
-"""From base and overrides to a case, whose labels are left to the plan."""
+"""Makes a case, without labels, of a base and overrides."""
 
 
 def load_plan(
@@ -220,23 +220,23 @@ def load_plan(
 ) -> Plan:
     """Read a campaign file, make its scenes and links, and lay out its points.
 
-    `environment` is part of every task's id; `overrides` are what `--set` takes, e.g. `"campaign.seeds=2"`:
-    the value is TOML, or else plain text.
+    `environment` is part of every task's id; `overrides` are as of `--set`, e.g. `"campaign.seeds=2"`: the
+    value is TOML, or else plain text.
 
     Raises:
         ConfigError: All faults of the file, one line each.
     """
     table = read_toml(path)
     for override in overrides:
-        _override(table, override)
+        _apply_override(table, override)
     try:
         file = build_spec(_File, table)
-    except SpecError as refused:
-        raise ConfigError("\n".join(refused.lines(f"{path}: "))) from refused
+    except SpecError as error:
+        raise ConfigError("\n".join(error.lines(f"{path}: "))) from error
     folder = Path(path).parent
     faults: list[str] = []
-    scenes = _cases("scene", file.scene, folder, scene_of, faults, path)
-    links = _cases("link", file.link, folder, link_of, faults, path)
+    scenes = _make_cases("scene", file.scene, folder, scene_of, faults, path)
+    links = _make_cases("link", file.link, folder, link_of, faults, path)
     varied = {f"scene.{key}" for scene in scenes for key in scene.labels}
     varied |= {f"link.{key}" for link in links for key in link.labels}
     merge = file.campaign.merge
@@ -248,25 +248,25 @@ def load_plan(
             faults.append(f"{path}: campaign.merge: '{key}' is not varied (varied: {known})")
     if faults:
         raise ConfigError("\n".join(dict.fromkeys(faults)))
-    head = file.campaign
-    tasks = len(scenes) * len(links) * head.seeds
+    campaign = file.campaign
+    tasks = len(scenes) * len(links) * campaign.seeds
     if tasks > _MOST_TASKS:
         raise ConfigError(
-            f"{path}: {len(scenes)} scenes x {len(links)} links x {head.seeds} seeds: {tasks} tasks,"
+            f"{path}: {len(scenes)} scenes x {len(links)} links x {campaign.seeds} seeds: {tasks} tasks,"
             f" expected at most {_MOST_TASKS}"
         )
     return Plan(
-        head.name,
+        campaign.name,
         tuple(scenes),
         tuple(links),
-        tuple(range(head.first_seed, head.first_seed + head.seeds)),
-        StopRule(head.max_bits, head.max_errors),
+        tuple(range(campaign.first_seed, campaign.first_seed + campaign.seeds)),
+        StopRule(campaign.max_bits, campaign.max_errors),
         merge,
         dict(environment),
     )
 
 
-def _override(table: dict[str, Any], text: str) -> None:
+def _apply_override(table: dict[str, Any], text: str) -> None:
     name, equals, value = text.partition("=")
     section, dot, key = (part.strip() for part in name.partition("."))
     if not (equals and dot and key) or section not in ("campaign", "scene", "link"):
@@ -276,41 +276,41 @@ def _override(table: dict[str, Any], text: str) -> None:
     if section != "campaign" and isinstance(keys, dict):
         for name in ("grid", "set"):
             if isinstance(inner := keys.get(name, {}), dict):
-                keys[name] = {k: v for k, v in _flat(inner).items() if k != key}
+                keys[name] = {k: v for k, v in _flatten(inner).items() if k != key}
         keys = keys["set"]
     if isinstance(keys, dict):
         keys[key] = parsed
 
 
-def _cases(
+def _make_cases(
     kind: str, grid: _Grid, folder: Path, make: MakeCase, faults: list[str], path: Path | str
 ) -> list[Case]:
-    fixed = _flat(grid.set)
-    axes = _flat(grid.grid)
+    fixed = _flatten(grid.set)
+    axes = _flatten(grid.grid)
     for key, values in axes.items():
         if not isinstance(values, list) or not values:
             faults.append(f"{path}: {kind}.grid.{key} = {values!r}: expected a list of values")
         elif len({repr(v) for v in values}) < len(values):
             faults.append(f"{path}: {kind}.grid.{key}: a value stands there twice")
-    number = math.prod(len(values) for values in axes.values() if isinstance(values, list))
-    number *= max(len(grid.variants), 1)
-    if number > _MOST_CASES:
-        faults.append(f"{path}: {kind}: {number} cases of grid and variants, expected at most {_MOST_CASES}")
+    count = math.prod(len(values) for values in axes.values() if isinstance(values, list))
+    count *= max(len(grid.variants), 1)
+    if count > _MOST_CASES:
+        faults.append(f"{path}: {kind}: {count} cases of grid and variants, expected at most {_MOST_CASES}")
     if faults:
         return []
     base = grid.base
     cases = []
     for name, variant in (grid.variants or {"": {}}).items():
-        variant = _flat(variant)
-        its_base = variant.pop("base", base)
+        variant = _flatten(variant)
+        case_base = variant.pop("base", base)
         for values in itertools.product(*axes.values()):
             chosen = dict(zip(axes, values, strict=True))
-            overrides = [
-                f"{key}={to_toml_value(_located(value, folder.resolve()) if key.endswith('link') else value)}"
-                for key, value in (fixed | chosen | variant).items()
-            ]
+            settings = fixed | chosen | variant
+            for key in (key for key in settings if key.endswith("link")):
+                settings[key] = _resolve_file(settings[key], folder.resolve())
+            overrides = [f"{key}={to_toml_value(value)}" for key, value in settings.items()]
             try:
-                case = make(_located(its_base, folder), overrides)
+                case = make(_resolve_file(case_base, folder), overrides)
             except ConfigError as fault:
                 faults.extend(f"{path}: {kind}: {line}" for line in str(fault).splitlines())
                 continue
@@ -318,14 +318,14 @@ def _cases(
     return cases
 
 
-def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """`{"a": {"b": 1}}` and `{"a.b": 1}` are both `{"a.b": 1}`."""
-    found: dict[str, Any] = {}
+def _flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Flatten nested tables: `{"a": {"b": 1}}` and `{"a.b": 1}` both become `{"a.b": 1}`."""
+    flat: dict[str, Any] = {}
     for key, value in table.items():
-        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
-    return found
+        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {prefix + key: value}
+    return flat
 
 
-def _located(base: Any, folder: Path) -> Any:
-    """A file is named from the campaign's folder; a preset has no suffix."""
+def _resolve_file(base: Any, folder: Path) -> Any:
+    """Resolve the path of a file against the campaign's folder; a preset has no suffix."""
     return str(folder / base) if isinstance(base, str) and base.endswith(".toml") else base

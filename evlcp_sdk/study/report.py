@@ -1,4 +1,4 @@
-"""One self-contained page of a campaign: charts that answer the pointer, tables, configuration, digests.
+"""The self-contained page of a campaign: charts that answer the pointer, tables, configuration, digests.
 
 `report.drawing` draws the charts for papers.
 """
@@ -12,7 +12,7 @@ from markupsafe import Markup
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS
 from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.report.plots import DASHES, INK, SCRIPT, Plot
-from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, INTERVALS, Figure, measure, number_text
+from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, INTERVALS, Figure, format_number, measure_figure
 from evlcp_sdk.study.plan import digest_of
 from evlcp_sdk.study.summary import (
     AGREEMENT,
@@ -22,7 +22,7 @@ from evlcp_sdk.study.summary import (
     Reference,
     Series,
     Summary,
-    beside_paper,
+    compare_with_paper,
     verdict_of,
 )
 from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
@@ -31,18 +31,18 @@ from evlcp_sdk.suggestions import format_count
 Dash = Sequence[int]
 
 _ARROW = 2.0
-"""How far down an upper limit's arrow points, as a factor; each wing is a sixteenth of a segment wide."""
+"""Length of an upper limit's arrow, as a factor downwards; each wing is a sixteenth of a segment wide."""
 
 
-def charts_of(summary: Summary) -> list[Plot]:
-    """The charts of a campaign: BER, RMSE, gross errors, frames found, histogram, and positions if any."""
+def draw_charts(summary: Summary) -> list[Plot]:
+    """Draw the charts: BER, RMSE, gross errors, frames found, histogram, and positions if any."""
     note = f"Segments of {SEGMENT_M} m. {INTERVALS}"
     limit = f"{note} An arrow is an upper limit: not one error was seen, in one segment or in all that the"
     limit += " paper has one figure for."
     nearest = f"{note} The distance is that of the nearest bar."
 
-    def plot(id: str, y_name: str, title: str, note: str = note, **more: Any) -> Plot:
-        return Plot(id, "distance, m", y_name, title, note, **more)
+    def plot(id: str, y_name: str, title: str, note: str = note, **options: Any) -> Plot:
+        return Plot(id, "distance, m", y_name, title, note, **options)
 
     by_kind = {
         "ber": plot("ber", "bit error rate", "Bit error rate", limit, log_y=True),
@@ -64,44 +64,44 @@ def charts_of(summary: Summary) -> list[Plot]:
         from_zero=True,
     )
     series = summary.series
-    scenes, links = ([_part(one, prefix) for one in series] for prefix in ("scene.", "link."))
+    scenes, links = ([_label_key(one, prefix) for one in series] for prefix in ("scene.", "link."))
     for number, one in enumerate(series):
         scene, link = ([*dict.fromkeys(parts)].index(parts[number]) for parts in (scenes, links))
-        # Colour is the scene, dash the link; neighbours stand a little apart.
-        own = scene if len(set(scenes)) > 1 else link
-        look = TRANSMITTER_COLOURS[own % len(TRANSMITTER_COLOURS)], DASHES[link % len(DASHES)]
+        # Colour shows the scene, dash the link; neighbours are shifted a little.
+        colour = scene if len(set(scenes)) > 1 else link
+        style = TRANSMITTER_COLOURS[colour % len(TRANSMITTER_COLOURS)], DASHES[link % len(DASHES)]
         shift = (number - (len(series) - 1) / 2) * min(0.7, 5 / max(len(series), 1))
         for kind, chart in by_kind.items():
-            _draw_segments(chart, one, kind, shift, *look)
-        _draw_bins(histogram, one, *look)
+            _draw_segments(chart, one, kind, shift, *style)
+        _draw_bins(histogram, one, *style)
     for reference in PAPER:
         _draw_reference(by_kind[reference.measure], reference)
     *by_distance, positions = by_kind.values()
     return [*by_distance, histogram, *([] if positions.empty else [positions])]
 
 
-def _part(series: Series, prefix: str) -> str:
+def _label_key(series: Series, prefix: str) -> str:
     return repr([(k, v) for k, v in series.labels.items() if k.startswith(prefix)])
 
 
 def _draw_segments(plot: Plot, series: Series, kind: str, shift: float, colour: str, dash: Dash) -> None:
-    """Draw a figure of each segment with its interval; on a logarithmic axis, none is an upper limit."""
+    """Draw a figure of each segment with its interval; on a logarithmic axis, 0 as an upper limit."""
     xs, ys, labels, dots, stems = [], [], [], [], []
-    for begin, end in _spans(series, kind):
-        figure = measure(series.between(begin, end), kind)
+    for begin, end in _find_spans(series, kind):
+        figure = measure_figure(series.tallies_between(begin, end), kind)
         if not figure.count:
             continue
-        none = plot.log_y and figure.none
-        x, y = (begin + end) / 2 + shift, figure.high if none else figure.value
-        shown = f"below {figure.high:.2g}" if none else f"{figure.value:.4g}"
-        what = f"{shown}, counted on {figure.count:,}"
-        labels.append(f"{series.name}\n{begin} to {end} m: {what}\n{_interval(figure)}")
+        is_limit = plot.log_y and figure.is_zero
+        x, y = (begin + end) / 2 + shift, figure.high if is_limit else figure.value
+        value = f"below {figure.high:.2g}" if is_limit else f"{figure.value:.4g}"
+        text = f"{value}, counted on {figure.count:,}"
+        labels.append(f"{series.name}\n{begin} to {end} m: {text}\n{_interval_text(figure)}")
         xs.append(x)
         ys.append(y)
-        dots.append(math.nan if none else y)
+        dots.append(math.nan if is_limit else y)
         left, right, tip, wing = x - SEGMENT_M / 16, x + SEGMENT_M / 16, y / _ARROW, y / _ARROW**0.8
         arrow = [x, x, left, x, right], [y, tip, wing, tip, wing]
-        stems.append(arrow if none else ([x, x], [figure.low, figure.high]))
+        stems.append(arrow if is_limit else ([x, x], [figure.low, figure.high]))
     plot.line(xs, dots, colour, series.name, dash)
     plot.dots(xs, dots, colour, series.name)
     plot.label(xs, ys, labels, series.name)
@@ -109,26 +109,31 @@ def _draw_segments(plot: Plot, series: Series, kind: str, shift: float, colour: 
         plot.line(stem_x, stem_y, colour, series.name, dash, kind="stem")
 
 
-def _spans(series: Series, kind: str) -> list[tuple[int, int]]:
-    """Where each figure begins and ends, m: segments, together where the paper has one figure for them.
+def _find_spans(series: Series, kind: str) -> list[tuple[int, int]]:
+    """Find the ranges of distance of the figures, m: segments, or the paper's range where it has one figure
+    for them.
 
-    That is where not one error was seen, and a segment alone is too little data to stay below the paper's.
+    The latter if not one error was seen, and a segment alone has too little data to stay below the paper's
+    figure.
     """
     spans = [(begin, begin + SEGMENT_M) for begin, _ in series.segments]
     for paper in (one for one in PAPER if one.measure == kind):
         whole = paper.from_m, paper.to_m
-        inside = [span for span in spans if whole[0] <= span[0] and span[1] <= whole[1]]
-        few = [verdict_of(measure(series.between(*span), kind), paper) == "too few" for span in inside]
-        if any(few) and measure(series.between(*whole), kind).none:
-            spans = [span for span in spans if span not in inside] + [whole]
+        contained = [span for span in spans if whole[0] <= span[0] and span[1] <= whole[1]]
+        too_few = [
+            verdict_of(measure_figure(series.tallies_between(*span), kind), paper) == "too few"
+            for span in contained
+        ]
+        if any(too_few) and measure_figure(series.tallies_between(*whole), kind).is_zero:
+            spans = [span for span in spans if span not in contained] + [whole]
     return sorted(spans)
 
 
-def _interval(figure: Figure) -> str:
-    """What the ends of an error bar are."""
+def _interval_text(figure: Figure) -> str:
+    """Describe the ends of an error bar."""
     if math.isnan(figure.high):
         return "one recording: no interval"
-    few = figure.recordings < FEWEST_RECORDINGS and not figure.none
+    few = figure.recordings < FEWEST_RECORDINGS and not figure.is_zero
     kind = f"range of {figure.recordings} recordings" if few else "95 %"
     return f"{kind}: {figure.low:.3g} to {figure.high:.3g}"
 
@@ -152,7 +157,7 @@ def _draw_bins(plot: Plot, series: Series, colour: str, dash: Dash) -> None:
 
 
 def _draw_reference(plot: Plot, reference: Reference) -> None:
-    """Draw a figure of the paper as a level, and write it above."""
+    """Draw a figure of the paper as a level, with its value above."""
     clusters, speed_kmh = reference.clusters, reference.speed_kmh
     parts = [f"{clusters} cluster{'s' * (clusters != 1)}"] if clusters and speed_kmh else []
     parts += [f"{speed_kmh:g} km/h"] if speed_kmh else ["20 to 40 km/h"]
@@ -165,14 +170,14 @@ def _draw_reference(plot: Plot, reference: Reference) -> None:
     plot.name(reference.from_m, reference.value, text + (f" ({clusters})" if clusters else ""))
 
 
-def page(summary: Summary) -> str:
-    """The page's HTML."""
-    charts, beside = charts_of(summary), beside_paper(summary.series)
+def render_campaign(summary: Summary) -> str:
+    """Render the page as HTML."""
+    charts, comparisons = draw_charts(summary), compare_with_paper(summary.series)
 
-    def marked(verdict: str) -> Markup:
-        return Markup('<span class="{}">{}</span>').format(_MARKED[verdict], verdict)
+    def mark_verdict(verdict: str) -> Markup:
+        return Markup('<span class="{}">{}</span>').format(_VERDICT_CLASSES[verdict], verdict)
 
-    # Labels are known once a chart is drawn.
+    # Labels exist once a chart is drawn.
     drawn = [(chart, chart.markup()) for chart in charts]
     rule = summary.plan.rule
     return render_page(
@@ -181,9 +186,9 @@ def page(summary: Summary) -> str:
         [SCRIPT],
         {"plots": {chart.id: chart.labels for chart in charts}},
         summary=summary,
-        about=_about(summary),
+        about=_progress_text(summary),
         charts=drawn,
-        beside=[[*row[:-1], marked(row[-1])] for row in comparison_rows(beside)],
+        comparisons=[[*row[:-1], mark_verdict(row[-1])] for row in paper_rows(comparisons)],
         paper=PAPER_NAME,
         paper_head=PAPER_HEAD,
         agreement=AGREEMENT,
@@ -192,45 +197,42 @@ def page(summary: Summary) -> str:
         position_head=POSITION_HEAD,
         intervals=INTERVALS,
         all_figures=figure_rows(summary),
-        ends=(_limit(rule.max_bits, "bits"), _limit(rule.max_errors, "wrong bits")),
-        cases=_cases(summary),
+        ends=(_limit_text(rule.max_bits, "bits"), _limit_text(rule.max_errors, "wrong bits")),
+        cases=_describe_cases(summary),
     )
 
 
-def _about(summary: Summary) -> str:
-    """How much was done."""
-    few = summary.done < summary.tasks
-    done = f"{summary.done} of {summary.tasks} tasks" if few else format_count(summary.done, "task")
+def _progress_text(summary: Summary) -> str:
+    """Amount of work done, in words."""
+    is_partial = summary.done < summary.tasks
+    done = f"{summary.done} of {summary.tasks} tasks" if is_partial else format_count(summary.done, "task")
     statistics = [one.statistics for one in summary.series]
     events, seconds = sum(s.events for s in statistics), sum(s.duration_us for s in statistics) * 1e-6
     return f"{done}, {seconds:,.1f} s received, {events / 1e6:,.1f} million events."
 
 
-_MARKED = {"better": "yes", "agrees": "", "worse": "no", "too few": ""}
+_VERDICT_CLASSES = {"better": "yes", "agrees": "", "worse": "no", "too few": ""}
 _MEASURES = {"ber": "bit error rate", "rmse_m": "distance RMSE, m", "gross_share": "errors of 0.5 m or more"}
 
 
 PAPER_HEAD = ("figure", "distance", "series", "paper", "here", "95 %", "verdict")
 
 
-def comparison_rows(comparisons: Iterable[PaperComparison]) -> list[tuple[str, ...]]:
+def paper_rows(comparisons: Iterable[PaperComparison]) -> list[tuple[str, ...]]:
     """Rows of `PAPER_HEAD`, as text."""
     rows: list[tuple[str, ...]] = []
     for one in comparisons:
-        r, percent = one.reference, one.reference.measure == "gross_share"
-        wide = (r.from_m, r.to_m) != (one.from_m, one.to_m)
-
-        def shown(value: float, percent: bool = percent) -> str:
-            return f"{value:.2%}" if percent else f"{value:.3g}"
-
+        r = one.reference
+        is_part = (r.from_m, r.to_m) != (one.from_m, one.to_m)
+        form = ".2%" if r.measure == "gross_share" else ".3g"
         rows.append(
             (
                 _MEASURES[r.measure],
                 f"{r.from_m} to {r.to_m} m",
                 one.series,
-                ("at most " if r.bound else "") + shown(r.value),
-                shown(one.ours.value) + (f" at {one.from_m} to {one.to_m} m" if wide else ""),
-                one.ours.interval(".2%" if percent else ".3g") or "-",
+                ("at most " if r.bound else "") + f"{r.value:{form}}",
+                f"{one.ours.value:{form}}" + (f" at {one.from_m} to {one.to_m} m" if is_part else ""),
+                one.ours.interval(form) or "-",
                 one.verdict,
             )
         )
@@ -244,7 +246,7 @@ POSITION_HEAD = (
 
 
 def position_rows(summary: Summary) -> list[tuple[str, ...]]:
-    """What became of positions and tracks, a row a series, all distances together, as text."""
+    """Rows of positions and tracks, one a series, all distances together, as text."""
     rows: list[tuple[str, ...]] = []
     for one in summary.series:
         t = one.statistics.total()
@@ -255,18 +257,18 @@ def position_rows(summary: Summary) -> list[tuple[str, ...]]:
                 one.name,
                 f"{t.fixes} of {t.fixes + t.fixes_refused}",
                 f"{t.fixes_contradicted}",
-                number_text(t.kept_share, ".1%"),
+                format_number(t.kept_share, ".1%"),
                 f"{t.fixes_excluded}",
-                ", ".join(number_text(m, ".3f") for m in (t.position_median_m, t.position_95_m)),
-                number_text(t.position_nees, ".3g"),
+                ", ".join(format_number(m, ".3f") for m in (t.position_median_m, t.position_95_m)),
+                format_number(t.position_nees, ".3g"),
                 f"{t.fixes_silent}",
                 f"{t.fixes_uncovered}",
                 f"{t.fixes_protected}",
                 f"{t.fixes_beyond}",
-                number_text(t.track_rmse_m, ".3f"),
-                number_text(t.track_nees, ".3g"),
-                number_text(t.smoothed_rmse_m, ".3f"),
-                number_text(t.smoothed_nees, ".3g"),
+                format_number(t.track_rmse_m, ".3f"),
+                format_number(t.track_nees, ".3g"),
+                format_number(t.smoothed_rmse_m, ".3f"),
+                format_number(t.smoothed_nees, ".3g"),
             )
         )
     return rows
@@ -283,26 +285,26 @@ def figure_rows(summary: Summary) -> tuple[list[str], list[list[str]]]:
     rows = []
     for one in summary.series:
         for begin, recordings in one.segments:
-            t = Tally.together(recordings)
+            t = Tally.sum(recordings)
             row = [
                 one.name,
                 f"{begin} to {begin + SEGMENT_M} m",
                 f"{t.frames_found} of {t.frames_sent}",
                 f"{t.bit_errors} of {t.bits}",
-                _shown(recordings, "ber", ".2g"),
-                _shown(recordings, "rmse_m", ".3f"),
-                number_text(t.bias_m, "+.3f"),
-                _shown(recordings, "gross_share", ".2%"),
+                _figure_text(recordings, "ber", ".2g"),
+                _figure_text(recordings, "rmse_m", ".3f"),
+                format_number(t.bias_m, "+.3f"),
+                _figure_text(recordings, "gross_share", ".2%"),
             ]
             if messages:
                 row += [f"{t.messages_found} of {t.messages_sent}", f"{t.messages_wrong}"]
             if positions:
                 row += [
                     f"{t.fixes} of {t.fixes + t.fixes_refused}",
-                    _shown(recordings, "position_rmse_m", ".3f"),
-                    number_text(t.position_median_m, ".3f"),
-                    number_text(t.position_95_m, ".3f"),
-                    number_text(t.position_nees, ".2f"),
+                    _figure_text(recordings, "position_rmse_m", ".3f"),
+                    format_number(t.position_median_m, ".3f"),
+                    format_number(t.position_95_m, ".3f"),
+                    format_number(t.position_nees, ".2f"),
                 ]
             rows.append(row)
     return head, rows
@@ -311,21 +313,21 @@ def figure_rows(summary: Summary) -> tuple[list[str], list[list[str]]]:
 _POSITION_HEAD = ["positions", "RMSE in space, m", "half within, m", "95 % within, m", "NEES, ideally 3"]
 
 
-def _shown(recordings: Sequence[Tally], kind: str, form: str) -> str:
-    figure = measure(recordings, kind)
+def _figure_text(recordings: Sequence[Tally], kind: str, form: str) -> str:
+    figure = measure_figure(recordings, kind)
     return f"{figure.value:{form}} {figure.interval(form)}".rstrip() if figure.count else "-"
 
 
-def _cases(summary: Summary) -> Iterator[tuple[str, Any]]:
-    """Each scene and link with what it is."""
+def _describe_cases(summary: Summary) -> Iterator[tuple[str, Any]]:
+    """Name and identity of each scene and link."""
     for kind, cases in (("scene", summary.plan.scenes), ("link", summary.plan.links)):
         for case in cases:
             labels = ", ".join(f"{k} {v}" for k, v in case.labels.items()) or "the only one"
             identity = case.identity
-            known = isinstance(identity, dict) and "digest" in identity
-            digest = identity["digest"] if known else digest_of(identity)
+            has_digest = isinstance(identity, dict) and "digest" in identity
+            digest = identity["digest"] if has_digest else digest_of(identity)
             yield f"{kind}: {labels}; SHA-256 {digest}", identity
 
 
-def _limit(value: int | None, what: str) -> str:
+def _limit_text(value: int | None, what: str) -> str:
     return f"any number of {what}" if value is None else f"{value:,} {what}"

@@ -1,8 +1,8 @@
-"""Decoded frames held against the truth of a recording: two scores of the same rows.
+"""Scores of decoded frames against the truth of a recording: two of the same rows.
 
 The plain score counts every row, and every cluster of every frame: a symbol that is not given counts as all
-bits wrong. The road score knows what a road adds: rows that are declared reflections are left out, a symbol
-that is not given is erased and no error, and one of a hidden cluster is claimed.
+bits wrong. The road score leaves out declared reflections; a symbol that is not given is erased and no error,
+and one of a hidden cluster is claimed.
 """
 
 from collections.abc import Iterable, Mapping
@@ -18,14 +18,14 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.folder import read_summary
 from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.study.frames import FrameRow
-from evlcp_sdk.study.match import match
-from evlcp_sdk.study.measure import bar_tallies
+from evlcp_sdk.study.match import match_frames
+from evlcp_sdk.study.measure import tally_bar
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
 
 _FARTHEST_M = 200
-"""Segments from here on are not written."""
+"""Segments from here on are left out."""
 
-_OF_ROADS = ("erased", "claimed", "bias_m", "worst_m", "nees")
+_ROAD_FIGURES = ("erased", "claimed", "bias_m", "worst_m", "nees")
 """Figures of the road score alone."""
 
 
@@ -34,17 +34,17 @@ def score_frames(
 ) -> dict[str, Any]:
     """Both scores as JSON values: the plain one's keys, and the road score under `road`."""
     frames = list(frames)
-    plain, road = (_score(frames, truth, links, road=road) for road in (False, True))
+    plain, road = (_score_bars(frames, truth, links, road=road) for road in (False, True))
     return plain | {"road": road}
 
 
-def _score(
+def _score_bars(
     frames: list[FrameRow], truth: Truth, links: Mapping[str, Link] | None, *, road: bool
 ) -> dict[str, Any]:
-    found = match(frames, truth, road=road, links=links)
+    found = match_frames(frames, truth, road=road, links=links)
     bars = []
     for sent, pairs in zip(found.bars, found.pairs, strict=True):
-        row = _figures(Statistics.of(bar_tallies(sent, pairs)), road=road)
+        row = _bar_figures(Statistics.of(tally_bar(sent, pairs)), road=road)
         if links:
             link = sent.bar.link
             row["link"] = next((name for name, one in links.items() if not find_differences(link, one)), None)
@@ -53,7 +53,7 @@ def _score(
     return {"rows": len(frames), "unmatched": found.unmatched} | echoes | {"bars": bars}
 
 
-def _figures(bar: Statistics, *, road: bool) -> dict[str, Any]:
+def _bar_figures(bar: Statistics, *, road: bool) -> dict[str, Any]:
     """Figures of one bar, rounded; None where nothing was measured."""
     tally = bar.total()
     # A symbol that is not given counts as all bits wrong, or not at all.
@@ -83,16 +83,16 @@ def _figures(bar: Statistics, *, road: bool) -> dict[str, Any]:
             if tally.ranged and 0 <= start < _FARTHEST_M
         },
     }
-    return {key: value for key, value in figures.items() if road or key not in _OF_ROADS}
+    return {key: value for key, value in figures.items() if road or key not in _ROAD_FIGURES}
 
 
 def links_of_result(folder: Path | str, registry: Registry | None = None) -> dict[str, Link]:
     """The links that a result was received with, from its `summary.json`; none without that file.
 
-    Of one link, the name is empty.
+    A single link has an empty name.
 
     Raises:
-        InputError: The file cannot be read, or does not say a configuration.
+        InputError: The file cannot be read, or has no configuration.
         ConfigError: The configuration cannot be resolved here.
     """
     summary = read_summary(folder)
@@ -104,8 +104,8 @@ def links_of_result(folder: Path | str, registry: Registry | None = None) -> dic
     return {name: _link_of(path, f"links.{name}.", part, registry) for name, part in several.items()}
 
 
-def _link_of(path: Path, where: str, part: Any, registry: Registry | None) -> Link:
+def _link_of(path: Path, prefix: str, part: Any, registry: Registry | None) -> Link:
     table = part.get("configuration") if isinstance(part, dict) else None
     if not isinstance(table, dict):
-        raise InputError(f"{path}: {where}configuration: expected a table")
+        raise InputError(f"{path}: {prefix}configuration: expected a table")
     return resolve(table, registry, source=str(path))

@@ -1,6 +1,7 @@
-"""What a campaign found: one series a combination of what it varies, one row a segment of distance.
+"""Results of a campaign: one series for each combination of what it varies, one row for each segment of
+distance.
 
-Recordings with the same seed shake alike, at whatever distance: a seed counts as one recording.
+Recordings with the same seed have the same vibration, at whatever distance: a seed counts as one recording.
 """
 
 import json
@@ -12,21 +13,21 @@ from typing import Any, Literal
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.study.collect import Counted
-from evlcp_sdk.study.intervals import Figure, measure
+from evlcp_sdk.study.collect import PointProgress
+from evlcp_sdk.study.intervals import Figure, measure_figure
 from evlcp_sdk.study.plan import Plan
 from evlcp_sdk.study.store import Store
-from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally, known
+from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally, value_or_none
 
 
 @dataclass(frozen=True)
 class Series:
-    """Points that differ in nothing but what the campaign merges.
+    """Points that differ only in what the campaign merges.
 
     Attributes:
-        labels: What sets it apart from the other series.
+        labels: What distinguishes it from other series.
         scene, link: Identities of its first scene, and of its link.
-        recordings: What counts of its points, added up seed by seed.
+        recordings: Statistics of its points, added up seed by seed.
     """
 
     labels: Mapping[str, Any]
@@ -36,17 +37,17 @@ class Series:
 
     @cached_property
     def statistics(self) -> Statistics:
-        """All recordings together."""
+        """Sum of all recordings."""
         return sum(self.recordings, Statistics())
 
     @cached_property
     def segments(self) -> tuple[tuple[int, tuple[Tally, ...]], ...]:
         """(Start of the segment in m, the tally of each recording), in order."""
-        return tuple((at, self.between(at, at + SEGMENT_M)) for at in self.statistics.segments)
+        return tuple((at, self.tallies_between(at, at + SEGMENT_M)) for at in self.statistics.segments)
 
     @property
     def name(self) -> str:
-        """What sets it apart, in words."""
+        """Its labels in words."""
         parts = []
         for key, value in self.labels.items():
             word = key.rpartition(".")[2]
@@ -63,25 +64,24 @@ class Series:
 
     @property
     def clusters(self) -> int | None:
-        """Clusters that its distances are measured from; None where the link does not say."""
+        """Number of clusters that its distances are measured from; None if unknown."""
         try:
             table = self.link["table"]
             chosen = table.get("ranging", {}).get("clusters")
             return len(chosen) if chosen else BarLayout.of_table(table["bar"]).clusters
         except (TypeError, KeyError, AttributeError, ValueError, ConfigError):
-            # An identity is whatever its link was when it was kept.
+            # Stored identities of other versions may lack anything.
             return None
 
     @property
     def speed_kmh(self) -> float | None:
-        """Speed of the camera, km/h; None where the scene does not say."""
+        """Speed of the camera, km/h; None if unknown."""
         return _speed_kmh(self.scene)
 
-    def between(self, from_m: int, to_m: int) -> tuple[Tally, ...]:
-        """The tally of each recording, of the segments that lie between two distances."""
+    def tallies_between(self, from_m: int, to_m: int) -> tuple[Tally, ...]:
+        """The tally of each recording over the segments between two distances."""
         return tuple(
-            Tally.together(t for at, t in one.segments.items() if from_m <= at < to_m)
-            for one in self.recordings
+            Tally.sum(t for at, t in one.segments.items() if from_m <= at < to_m) for one in self.recordings
         )
 
 
@@ -101,7 +101,7 @@ def _speed_kmh(scene: Any) -> float | None:
 
 @dataclass(frozen=True)
 class Summary:
-    """A campaign's outcome: how many tasks count or would, and are done; its series in order; its plan."""
+    """A campaign's outcome: how many tasks count or may, and are done; its series in order; its plan."""
 
     tasks: int
     done: int
@@ -129,7 +129,7 @@ class Summary:
                     "echoes": s.statistics.echoes,
                     "sigma_m": s.statistics.sigma_m if s.statistics.stated else None,
                     "segments": [
-                        {"from_m": at, "to_m": at + SEGMENT_M} | _figures(tallies)
+                        {"from_m": at, "to_m": at + SEGMENT_M} | _segment_figures(tallies)
                         for at, tallies in s.segments
                     ],
                 }
@@ -137,15 +137,15 @@ class Summary:
             ],
             "paper": [
                 asdict(c.reference)
-                | {"series": c.series, "ours": _known(c.ours), "ours_at_m": [c.from_m, c.to_m]}
+                | {"series": c.series, "ours": _figure_values(c.ours), "ours_at_m": [c.from_m, c.to_m]}
                 | {"verdict": c.verdict}
-                for c in beside_paper(self.series)
+                for c in compare_with_paper(self.series)
             ],
         }
 
 
-def _figures(recordings: Sequence[Tally]) -> dict[str, Any]:
-    tally = Tally.together(recordings)
+def _segment_figures(recordings: Sequence[Tally]) -> dict[str, Any]:
+    tally = Tally.sum(recordings)
     kinds = ("ber", "rmse_m", "gross_share", "found_share", "lost_share", "wrong_share", "position_rmse_m")
     names = (
         *("frames_sent", "frames_found", "bits", "bit_errors", "ranged", "gross"),
@@ -158,38 +158,38 @@ def _figures(recordings: Sequence[Tally]) -> dict[str, Any]:
         *("position_median_m", "position_95_m", "position_nees"),
         *("kept_share", "track_rmse_m", "track_nees", "smoothed_rmse_m", "smoothed_nees"),
     )
-    found = {name: known(getattr(tally, name)) for name in (*names, *figures)}
-    return found | {kind: _known(measure(recordings, kind)) for kind in kinds}
+    found = {name: value_or_none(getattr(tally, name)) for name in (*names, *figures)}
+    return found | {kind: _figure_values(measure_figure(recordings, kind)) for kind in kinds}
 
 
-def _known(figure: Figure) -> dict[str, Any]:
-    return {name: known(value) for name, value in asdict(figure).items()}
+def _figure_values(figure: Figure) -> dict[str, Any]:
+    return {name: value_or_none(value) for name, value in asdict(figure).items()}
 
 
 def summarize(store: Store) -> Summary:
-    """Add up what counts in a store.
+    """Add up the results that count in a store.
 
     Raises:
         InputError: No campaign has started in it.
     """
-    plan = store.plan()
-    results = store.results()
+    plan = store.read_plan()
+    results = store.read_results()
     merged = set(plan.merge)
-    found: dict[str, Series] = {}
+    all_series: dict[str, Series] = {}
     tasks = done = 0
     for point in plan.points:
-        counted = Counted(point.tasks, plan.rule, results)
-        tasks += counted.needed
-        done += counted.done
+        progress = PointProgress(point.tasks, plan.rule, results)
+        tasks += progress.needed
+        done += progress.done
         labels = {k: v for k, v in point.labels.items() if k not in merged}
         key = json.dumps(labels)
-        before = found.get(key)
-        if before is None:
-            found[key] = Series(labels, point.scene.identity, point.link.identity, counted.recordings)
+        series = all_series.get(key)
+        if series is None:
+            all_series[key] = Series(labels, point.scene.identity, point.link.identity, progress.recordings)
         else:
-            pairs = zip_longest(before.recordings, counted.recordings, fillvalue=Statistics())
-            found[key] = replace(before, recordings=tuple(a + b for a, b in pairs))
-    return Summary(tasks, done, tuple(found.values()), plan)
+            pairs = zip_longest(series.recordings, progress.recordings, fillvalue=Statistics())
+            all_series[key] = replace(series, recordings=tuple(a + b for a, b in pairs))
+    return Summary(tasks, done, tuple(all_series.values()), plan)
 
 
 PAPER_NAME = "arXiv 2510.17203"
@@ -204,10 +204,10 @@ class Reference:
     Attributes:
         measure: Bit error rate, distance RMSE in m, or share of distance errors of half a metre or more.
         clusters: Clusters that the distance is measured from: 16, or the 2 of the method it compares with;
-            None where it does not matter.
-        speed_kmh: Speed of the car; None for 20, 30 and 40 km/h alike.
-        from_m: Start of the distances it holds for, m.
-        to_m: Their end, m.
+            None for any.
+        speed_kmh: Speed of the car; None for 20, 30 and 40 km/h together.
+        from_m: Start of its range of distance, m.
+        to_m: Its end, m.
         value: The figure.
         bound: The paper gives it as an upper bound.
     """
@@ -231,16 +231,16 @@ PAPER = (
     Reference("rmse_m", 2, 30.0, 40, 50, 0.4182),
     Reference("gross_share", 16, 30.0, 30, 60, 0.004),
 )
-"""Every figure of the paper that a simulated drive can be held against."""
+"""Every figure of the paper that a simulated drive can be compared with."""
 
 
 @dataclass(frozen=True)
 class PaperComparison:
-    """A figure of the paper beside ours.
+    """A figure of the paper with ours.
 
     Attributes:
         reference: The paper's.
-        series: Name of the series that it is held against.
+        series: Name of the series of ours.
         ours: The measured one; where the paper gives a bound, that of the worst segment.
         from_m, to_m: The distances that ours was measured at, m.
     """
@@ -253,23 +253,23 @@ class PaperComparison:
 
     @property
     def verdict(self) -> "Verdict":
-        """Ours beside the paper's, as `verdict_of` finds."""
+        """The verdict by `verdict_of`."""
         return verdict_of(self.ours, self.reference)
 
 
 Verdict = Literal["better", "agrees", "worse", "too few"]
 
 AGREEMENT = 0.3
-"""Up to what share two figures that agree differ."""
+"""Largest share by which two figures that agree differ."""
 
 
 def verdict_of(ours: Figure, reference: Reference) -> Verdict:
-    """Hold a figure against the paper's; the smaller one is the better.
+    """Compare a figure with the paper's; the smaller one is better.
 
-    A bound is kept, which agrees, or not, which is worse: how far the paper stays below it, it does not say.
-    Not one error is too few in less data than would show that there are fewer than the paper's.
+    A bound is kept, which agrees, or not, which is worse: how far the paper stays below it is unknown.
+    Without a single error, there are too few data if they would not show fewer errors than the paper's.
     """
-    if ours.none and ours.high > reference.value:
+    if ours.is_zero and ours.high > reference.value:
         return "too few"
     ratio = ours.value / reference.value
     if ratio > 1 + (0 if reference.bound else AGREEMENT):
@@ -277,21 +277,25 @@ def verdict_of(ours: Figure, reference: Reference) -> Verdict:
     return "agrees" if reference.bound or ratio >= 1 - AGREEMENT else "better"
 
 
-def beside_paper(series: Iterable[Series], references: Iterable[Reference] = PAPER) -> list[PaperComparison]:
-    """Hold series against the paper, each figure beside every series that it speaks of and that has data."""
+def compare_with_paper(
+    series: Iterable[Series], references: Iterable[Reference] = PAPER
+) -> list[PaperComparison]:
+    """Compare each figure of the paper with every series that it applies to and that has data."""
     series = list(series)
-    found = []
+    comparisons = []
     for reference in references:
         for one in series:
             if reference.clusters is not None and one.clusters != reference.clusters:
                 continue
             if reference.speed_kmh is not None and one.speed_kmh != reference.speed_kmh:
                 continue
-            # Of a bound, the largest figure of a segment within.
-            at = reference.from_m, reference.to_m
-            parts = [(m, m + SEGMENT_M) for m in range(*at, SEGMENT_M)] if reference.bound else [at]
-            measured = [(measure(one.between(*part), reference.measure), part) for part in parts]
-            if some := [pair for pair in measured if pair[0].count]:
-                ours, at = max(some, key=lambda pair: pair[0].value)
-                found.append(PaperComparison(reference, one.name, ours, *at))
-    return found
+            # A bound is compared with the largest figure of a segment.
+            span = reference.from_m, reference.to_m
+            spans = [(m, m + SEGMENT_M) for m in range(*span, SEGMENT_M)] if reference.bound else [span]
+            measured = [
+                (measure_figure(one.tallies_between(*part), reference.measure), part) for part in spans
+            ]
+            if nonempty := [pair for pair in measured if pair[0].count]:
+                ours, span = max(nonempty, key=lambda pair: pair[0].value)
+                comparisons.append(PaperComparison(reference, one.name, ours, *span))
+    return comparisons

@@ -1,4 +1,4 @@
-"""Statistics that add: what was counted of decoded frames, exact in any order of summation."""
+"""Addable statistics: counts of decoded frames, exact in any order of summation."""
 
 import math
 from collections import Counter
@@ -23,24 +23,24 @@ HALF_METRE_M = 0.5
 """Distance error from which on an error counts as gross, m."""
 
 SILENT_NEES = 14.156
-"""An error squared in its own sigmas is larger once in 370 fixes by chance: chi-square of three, 99.73 %."""
+"""NEES that is exceeded once in 370 fixes by chance: chi-square of three, 99.73 %."""
 
 _FARTHEST_BIN = 150
 _FARTHEST_POSITION_BIN = 1000
 _HISTOGRAMS = ("histogram", "position_histogram")
 _MOST = 10**40
-"""What is counted is less: all nanometres squared of all frames of a year are 1e30."""
+"""Above any sum: all nanometres squared of all frames of a year are 1e30."""
 
 Count = Annotated[int, Field(ge=0, lt=2**53)]
 Sum = Annotated[int, Field(ge=0, le=_MOST)]
 Histogram = dict[Annotated[int, Field(ge=-_FARTHEST_POSITION_BIN, le=_FARTHEST_POSITION_BIN)], Count]
 _LARGEST = ("worst_nm",)
 _MOST_SIGMAS = 1e6
-"""So many sigmas are wrong beyond all measure; an error in sigmas of 0 has no number."""
+"""Largest error that is counted, in sigmas; also for a sigma of 0."""
 
 
 def segment_of(distance_m: float) -> int:
-    """Where the segment of a distance starts, m.
+    """Start of the segment of a distance, m.
 
     >>> segment_of(49.9)
     40
@@ -48,15 +48,15 @@ def segment_of(distance_m: float) -> int:
     return math.floor(distance_m / SEGMENT_M) * SEGMENT_M
 
 
-def known(value: Any) -> Any:
+def value_or_none(value: Any) -> Any:
     """A value for JSON and CSV: None for a number that was not measured."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def in_nm(length_m: float) -> int:
-    """A length as a whole number of nanometres, so that sums are exact.
+def to_nm(length_m: float) -> int:
+    """Convert a length to a whole number of nanometres, so that sums are exact.
 
-    >>> in_nm(-0.05)
+    >>> to_nm(-0.05)
     -50000000
     """
     return round(length_m * 1e9)
@@ -67,18 +67,19 @@ class Ratio:
     """A figure of a tally: the ratio of two of its sums, NaN of nothing.
 
     Attributes:
-        above: What is summed above the line.
-        below: What is summed below it.
-        scale: What the ratio is multiplied by; of a root mean square, its root.
-        root: It is a root mean square.
-        of: What is independent at best, for a limit where `above` is 0; empty for `below`.
+        numerator: Name of the sum above the line.
+        denominator: Name of the sum below it.
+        scale: Factor of the ratio, or of its root.
+        root: Whether it is a root mean square.
+        independent: Name of the count that is independent at best, for a limit where `numerator` is 0; empty
+            for `denominator`.
     """
 
-    above: str
-    below: str
+    numerator: str
+    denominator: str
     scale: float = 1.0
     root: bool = False
-    of: str = ""
+    independent: str = ""
 
     @overload
     def __get__(self, tally: None, owner: type) -> Self: ...
@@ -87,21 +88,20 @@ class Ratio:
     def __get__(self, tally: object | None, owner: type) -> Self | float:
         if tally is None:
             return self
-        below = getattr(tally, self.below)
-        return self.value(getattr(tally, self.above) / below) if below else math.nan
+        below = getattr(tally, self.denominator)
+        return self.scale_ratio(getattr(tally, self.numerator) / below) if below else math.nan
 
-    def value(self, ratio: float) -> float:
+    def scale_ratio(self, ratio: float) -> float:
         """The figure of a ratio."""
         return (math.sqrt(ratio) if self.root else ratio) * self.scale
 
 
 @dataclass(frozen=True)
 class Tally:
-    """What was counted in one segment of distance. Every field adds; all are integers, so sums are exact.
+    """Counts in one segment of distance. Every field adds; all are integers, so that sums are exact.
 
-    A found frame has for each visible cluster a symbol that is given or erased (`-`); for a hidden one, a
-    symbol that is given all the same is claimed. A cluster that was visible for a part of the frame does not
-    count.
+    A found frame has for each visible cluster a symbol that is given or erased (`-`); a symbol given for a
+    hidden one is claimed. A cluster that was visible for a part of the frame does not count.
 
     Attributes:
         frames_sent: Frames that were sent whole while the recording ran.
@@ -109,7 +109,7 @@ class Tally:
         bits: Bits of the symbols that are given, of visible clusters.
         bit_errors: Wrong bits among them.
         visible: Symbols of visible clusters.
-        erased: Those of them that are not given.
+        erased: Those of them not given.
         erased_bits: Their bits.
         hidden: Symbols of hidden clusters.
         claimed: Those of them that are given.
@@ -127,9 +127,9 @@ class Tally:
         messages_wrong: Messages that were read and not sent so: undetected errors.
         fixes: Positions that were given.
         fixes_refused: Times at which a bar was in view, and no position was given.
-        fixes_contradicted: Those of them at which parts contradicted one another; at others, what was in view
-            does not determine a position.
-        fixes_excluded: Positions that were given without a part that the rest contradicts.
+        fixes_contradicted: Those of them at which parts contradicted one another; at others, the view does
+            not determine a position.
+        fixes_excluded: Positions given without a part that the rest contradicts.
         fixes_protected: Those with both protection levels.
         fixes_beyond: Those of these whose error is beyond one of them.
         fixes_silent: Positions whose error is beyond the 99.73 % bound of their own covariance.
@@ -184,14 +184,14 @@ class Tally:
     position_histogram: Histogram = field(default_factory=dict)
 
     @classmethod
-    def distance(cls, error_m: float, sigma_m: float = math.nan) -> Self:
+    def of_distance(cls, error_m: float, sigma_m: float = math.nan) -> Self:
         """One distance; its sigma is NaN for none.
 
-        >>> Tally.distance(-0.05).histogram
+        >>> Tally.of_distance(-0.05).histogram
         {-3: 1}
         """
-        error_nm = in_nm(error_m)
-        bin = max(-_FARTHEST_BIN, min(_FARTHEST_BIN, error_nm // in_nm(BIN_M)))
+        error_nm = to_nm(error_m)
+        bin = max(-_FARTHEST_BIN, min(_FARTHEST_BIN, error_nm // to_nm(BIN_M)))
         return cls(
             ranged=1,
             sum_nm=error_nm,
@@ -199,12 +199,12 @@ class Tally:
             gross=int(abs(error_m) >= HALF_METRE_M),
             worst_nm=abs(error_nm),
             with_sigma=int(not math.isnan(sigma_m)),
-            nees_micro=0 if math.isnan(sigma_m) else _nees_micro(_sigmas(error_m, sigma_m) ** 2),
+            nees_micro=0 if math.isnan(sigma_m) else _nees_micro(_error_sigmas(error_m, sigma_m) ** 2),
             histogram={bin: 1},
         )
 
     @classmethod
-    def fix(
+    def of_fix(
         cls,
         error_m: float,
         nees: float,
@@ -213,13 +213,13 @@ class Tally:
         protected: bool = False,
         beyond: bool = False,
     ) -> Self:
-        """One position that was given; its NEES is its error in space squared in its own sigmas.
+        """One given position; its NEES is its error in space squared in its own sigmas.
 
-        >>> Tally.fix(0.012, 2.5).position_histogram
+        >>> Tally.of_fix(0.012, 2.5).position_histogram
         {2: 1}
         """
-        error_nm = in_nm(error_m)
-        bin = min(_FARTHEST_POSITION_BIN, error_nm // in_nm(POSITION_BIN_M))
+        error_nm = to_nm(error_m)
+        bin = min(_FARTHEST_POSITION_BIN, error_nm // to_nm(POSITION_BIN_M))
         return cls(
             fixes=1,
             fixes_excluded=int(excluded),
@@ -233,19 +233,19 @@ class Tally:
         )
 
     @classmethod
-    def tracked(cls, filtered_m: float, nees: float, smoothed_m: float, smoothed_nees: float) -> Self:
+    def of_track_point(cls, filtered_m: float, nees: float, smoothed_m: float, smoothed_nees: float) -> Self:
         """One point of the track: its errors in space, m, and these squared in their own sigmas."""
         return cls(
             track=1,
-            track_squares_nm2=in_nm(filtered_m) ** 2,
+            track_squares_nm2=to_nm(filtered_m) ** 2,
             track_nees_micro=_nees_micro(nees),
-            smoothed_squares_nm2=in_nm(smoothed_m) ** 2,
+            smoothed_squares_nm2=to_nm(smoothed_m) ** 2,
             smoothed_nees_micro=_nees_micro(smoothed_nees),
         )
 
     @classmethod
-    def together(cls, tallies: Iterable["Tally"]) -> "Tally":
-        """All of them together."""
+    def sum(cls, tallies: Iterable["Tally"]) -> "Tally":
+        """Sum of tallies."""
         tallies = list(tallies)
         numbers: dict[str, Any] = {}
         for name in (f.name for f in fields(cls)):
@@ -260,14 +260,14 @@ class Tally:
         return cls(**numbers)
 
     def __add__(self, other: "Tally") -> "Tally":
-        return Tally.together((self, other))
+        return Tally.sum((self, other))
 
-    ber = Ratio("bit_errors", "bits", of="frames_found")
-    """Share of wrong bits among those given. A bit is wrong in a wrong frame: of these there are fewer."""
+    ber = Ratio("bit_errors", "bits", independent="frames_found")
+    """Share of wrong bits among those given; wrong bits come in wrong frames, which are fewer."""
 
     erased_share = Ratio("erased", "visible")
     claimed_share = Ratio("claimed", "hidden")
-    """Share of the visible clusters' symbols that are not given, and of the hidden ones' that are."""
+    """Share of the visible clusters' symbols not given, and of the hidden ones' given."""
 
     found_share = Ratio("frames_found", "frames_sent")
     """Share of the sent frames that were decoded."""
@@ -287,7 +287,7 @@ class Tally:
     """Share of the messages that were sent and not read, and of those that were read and are wrong."""
 
     kept_share = Ratio("fixes", "fixes_determined")
-    """Share of the positions that what is in view determines which are given."""
+    """Share of the positions determined by the view that are given."""
 
     position_rmse_m = Ratio("position_squares_nm2", "fixes", 1e-9, root=True)
     position_nees = Ratio("position_nees_micro", "fixes", 1e-6)
@@ -315,7 +315,7 @@ class Tally:
 
     @property
     def fixes_determined(self) -> int:
-        """Positions that what was in view determines, given or not."""
+        """Positions determined by the view, given or not."""
         return self.fixes + self.fixes_contradicted
 
     @property
@@ -331,7 +331,7 @@ class Tally:
     def position_quantile_m(self, share: float) -> float:
         """Error in space that a share of the positions stays below, to a bin, m; NaN without any.
 
-        >>> (Tally.fix(0.02, 1) + Tally.fix(0.9, 1)).position_quantile_m(0.5)
+        >>> (Tally.of_fix(0.02, 1) + Tally.of_fix(0.9, 1)).position_quantile_m(0.5)
         0.025
         """
         seen = 0
@@ -342,7 +342,7 @@ class Tally:
         return math.nan
 
 
-def _sigmas(error: float, sigma: float) -> float:
+def _error_sigmas(error: float, sigma: float) -> float:
     return min(abs(error / sigma), _MOST_SIGMAS) if sigma else _MOST_SIGMAS
 
 
@@ -352,17 +352,17 @@ def _nees_micro(nees: float) -> int:
 
 @dataclass(frozen=True)
 class Statistics:
-    """What one task or many measured together.
+    """Counts of one task or of many together.
 
     Attributes:
         tasks: Number of tasks.
-        events: Events that the sensor sent.
+        events: Events of the sensor.
         duration_us: Simulated time, us.
         packets: Decoded packets.
         rows: Decoded frames.
-        echoes: Those of them that the receiver declares a reflection; they count nowhere else.
+        echoes: Those of them that are declared reflections; they count nowhere else.
         unmatched: Those of them that match no sent one.
-        stated: Distances that come with a standard deviation, of matched frames and others.
+        stated: Distances with a standard deviation, of matched frames and others.
         sigma_squares_nm2: Sum of the squares of these standard deviations, nm^2.
         segments: Start of the segment in m to its tally, in order.
 
@@ -384,11 +384,11 @@ class Statistics:
 
     @classmethod
     def of(cls, tallies: Iterable[tuple[int, Tally]], **counts: int) -> Self:
-        """Statistics from tallies in any order, several a segment."""
-        found: dict[int, list[Tally]] = {}
+        """Statistics of tallies in any order, several a segment."""
+        by_segment: dict[int, list[Tally]] = {}
         for start, tally in tallies:
-            found.setdefault(start, []).append(tally)
-        return cls(**counts, segments={start: Tally.together(found[start]) for start in sorted(found)})
+            by_segment.setdefault(start, []).append(tally)
+        return cls(**counts, segments={start: Tally.sum(by_segment[start]) for start in sorted(by_segment)})
 
     def __add__(self, other: "Statistics") -> "Statistics":
         names = (f.name for f in fields(self) if f.name != "segments")
@@ -396,11 +396,11 @@ class Statistics:
         return Statistics.of([*self.segments.items(), *other.segments.items()], **counts)
 
     def total(self) -> Tally:
-        """The tally of all segments."""
-        return Tally.together(self.segments.values())
+        """Sum of all segments."""
+        return Tally.sum(self.segments.values())
 
     sigma_m = Ratio("sigma_squares_nm2", "stated", 1e-9, root=True)
-    """Root mean square of the standard deviations that come with distances, m."""
+    """Root mean square of the distances' standard deviations, m."""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as for JSON."""
@@ -408,7 +408,7 @@ class Statistics:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
-        """What `to_dict` gave, also as JSON gives it back.
+        """Statistics from `to_dict`, also by way of JSON.
 
         Raises:
             ConfigError: It is something else.

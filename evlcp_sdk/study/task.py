@@ -1,4 +1,4 @@
-"""One job of a campaign: render a scene, receive it with every link, compare what came out with the truth."""
+"""One job of a campaign: render a scene, receive it with every link, count it against the truth."""
 
 import hashlib
 import json
@@ -16,23 +16,23 @@ from evlcp_sdk.sim import Scene, Simulation, load_scene, truth_of
 from evlcp_sdk.sim.world import attitude_log, drop_reported_errors, survey_sites
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.match import check_link
-from evlcp_sdk.study.measure import message_tallies, position_tallies, statistics_of
+from evlcp_sdk.study.measure import statistics_of, tally_messages, tally_positions
 from evlcp_sdk.study.plan import Case, Job, Plan, digest_of, load_plan
 from evlcp_sdk.study.tally import Statistics
 from evlcp_sdk.values import Packet
 
 _PACKAGES = ("air", "link", "place", "plugin", "rx", "scene", "sim")
 _ON_AIR = ("air", "bar", "framing", "pilots", "modulation", "error-correction")
-"""Sections of a link that say what a bar sends, and from where; those that its framing has."""
+"""Sections of a link for what a bar sends and from where, as far as its framing has them."""
 
-_OF_POSITIONS = ("position", "camera_sigma")
-"""Sections of a link that a receiver does not read."""
+_UNUSED_SECTIONS = ("position", "camera_sigma")
+"""Sections of a link that a receiver does not use."""
 
 _STUDY = ("frames.py", "match.py", "measure.py", "tally.py", "task.py")
 
 
-def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
-    """Read a campaign file; scenes and links resolved, code and versions of this installation.
+def plan_campaign(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
+    """Read a campaign file and resolve its scenes and links, with code and versions of this installation.
 
     Raises:
         ConfigError: All faults of the file, one line each.
@@ -43,10 +43,9 @@ def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
         if base is None:
             raise ConfigError("base: missing; expected a preset or a scene file")
         scene = load_scene(base, settings, registry)
-        # What is only reported of a scene is not seen.
-        return Case(
-            value=scene, identity=_identity(scene), group=digest_of(_identity(drop_reported_errors(scene)))
-        )
+        # Scenes that differ only in reported values look the same.
+        group = digest_of(_scene_identity(drop_reported_errors(scene)))
+        return Case(value=scene, identity=_scene_identity(scene), group=group)
 
     def link_of(base: str | None, settings: Sequence[str]) -> Case:
         link = load_link(base, settings, registry)
@@ -61,15 +60,15 @@ def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
     return load_plan(path, scene_of, link_of, environment_of(registry), overrides)
 
 
-def _sending(scene: Scene, table: Mapping[str, Any]) -> Scene:
-    """The scene, its bars that say no link of their own sending with that of the campaign."""
+def _set_campaign_link(scene: Scene, table: Mapping[str, Any]) -> Scene:
+    """Set the campaign's link for bars of the scene without a link of their own."""
     link = {section: table[section] for section in _ON_AIR if section in table}
     bars = (replace(bar, link=link) if bar.link is None else bar for bar in scene.bars)
     return scene if scene.link is not None else replace(scene, bars=tuple(bars))
 
 
 def environment_of(registry: Registry) -> dict[str, Any]:
-    """What of the installation determines a result: versions, and the digest of the code that computes it."""
+    """The installation as far as it determines a result: versions, and the digest of the code."""
     import evlcp_sdk
 
     root = Path(evlcp_sdk.__file__).parent
@@ -86,8 +85,8 @@ def environment_of(registry: Registry) -> dict[str, Any]:
     return {"source": digest.hexdigest(), "versions": registry.versions()}
 
 
-def _identity(scene: Scene) -> Any:
-    """The scene as JSON values; of the files it names, what is in them instead of where they are."""
+def _scene_identity(scene: Scene) -> Any:
+    """The scene as JSON values, with digests of the files it names instead of their paths."""
     table = json.loads(json.dumps(asdict(scene)))
     for section, key in [(table["motion"], "path_file"), *((bar, "chips_file") for bar in table["bars"])]:
         if section[key] is not None:
@@ -99,12 +98,12 @@ def _identity(scene: Scene) -> Any:
 
 
 def run_job(job: Job) -> list[tuple[str, Statistics]]:
-    """Render the job's scene once, receive it with the link of every task, compare it with the truth.
+    """Render the job's scene once, receive it with the link of every task, and count it against the truth.
 
-    A bar without a link of its own sends with that of the tasks, which are alike in what is on air.
+    A bar without a link of its own sends with that of the tasks, which send the same.
 
     Raises:
-        ConfigError: This installation would not give what the task's id promises, or the scene sends with
+        ConfigError: This installation would not give the result of the task's id, or the scene sends with
             another link than a task receives with.
     """
     registry = Registry.load()
@@ -113,11 +112,11 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
             "code or versions here are not those of the campaign's plan: changed since it began"
             " (run it again), or other than on the machine that asks (install the same)"
         )
-    scene = _sending(job.scene, job.tasks[0].link[0])
+    scene = _set_campaign_link(job.scene, job.tasks[0].link[0])
     simulation = Simulation(scene, job.seed, registry=registry)
     truth = truth_of(simulation, registry=registry)
     received: dict[str, tuple[Receiver, list[Packet]]] = {}
-    parts = []
+    receptions = []
     for task in job.tasks:
         table, digest = task.link
         link = resolve(table, registry)
@@ -126,26 +125,28 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         check_link(truth, link, "the scene", messages=True)
         world = task.scene.world
         attitude = None if world is None else attitude_log(task.scene, job.seed, simulation.path)
-        # What is reported of sites, and what is made of it, makes no difference to what is received.
-        read = {section: dict(keys) for section, keys in link.table.items() if section not in _OF_POSITIONS}
-        key = digest_of([read, None if world is None else asdict(replace(world, survey_sigma_m=0.0))])
+        # Reported sites and positions make no difference to what is received.
+        used = {
+            section: dict(keys) for section, keys in link.table.items() if section not in _UNUSED_SECTIONS
+        }
+        key = digest_of([used, None if world is None else asdict(replace(world, survey_sigma_m=0.0))])
         if key not in received:
             received[key] = Receiver(link, attitude=attitude), []
-        parts.append((task, link, attitude, received[key][1]))
+        receptions.append((task, link, attitude, received[key][1]))
     messages = any(bar.sends_frames and bar.payload != "symbols" for bar in truth.bars)
-    number = 0
+    total = 0
     for events in simulation.stream():
-        number += len(events)
+        total += len(events)
         for receiver, packets in received.values():
             packets += receiver.feed(events)
     for receiver, packets in received.values():
         packets += receiver.close()
     results = []
-    for task, link, attitude, packets in parts:
-        others = message_tallies(packets, truth, link.block_coder()) if messages else []
+    for task, link, attitude, packets in receptions:
+        others = tally_messages(packets, truth, link.block_coder()) if messages else []
         if scene.world is not None:
-            sites = survey_sites(_sending(task.scene, task.link[0]), job.seed, registry)
-            others += position_tallies(packets, truth, link, attitude, sites)
-        counted = statistics_of(frames_of(packets), truth, events=number, packets=len(packets), others=others)
+            sites = survey_sites(_set_campaign_link(task.scene, task.link[0]), job.seed, registry)
+            others += tally_positions(packets, truth, link, attitude, sites)
+        counted = statistics_of(frames_of(packets), truth, events=total, packets=len(packets), others=others)
         results.append((task.id, counted))
     return results

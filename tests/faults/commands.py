@@ -26,7 +26,7 @@ from evlcp_sdk.errors import EvlcpError, InputError
 from evlcp_sdk.files import STAGE_PREFIX, read_json
 from evlcp_sdk.io.open import write_events
 from evlcp_sdk.results.folder import check_result_file, read_summary
-from evlcp_sdk.study.collect import collect
+from evlcp_sdk.study.collect import collect_results
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.values import Events, Packet
@@ -245,7 +245,7 @@ def simulate(_work, _demo):
 def sweep(work):
     """A campaign that meets a fault is whole after the same command once more; what was kept is true."""
     plan = fake_plan(2, 1, 1)
-    task.plan_of = lambda *_: plan
+    task.plan_campaign = lambda *_: plan
     task.run_job = run_fake
     out = work / "out"
     arguments = ("sweep", "campaign.toml", "-o", str(out / "r.sqlite"), "--workers", "0")
@@ -257,13 +257,13 @@ def sweep(work):
 
     def collected(path):
         with Store(path, create=True) as store:
-            collect(plan, store, Inline(), run_fake)
-            return store.results()
+            collect_results(plan, store, Inline(), run_fake)
+            return store.read_results()
 
     def kept():
         try:
             with Store(out / "r.sqlite") as store:
-                return store.results()
+                return store.read_results()
         except InputError:
             return {}  # nothing was kept yet, which is said
 

@@ -23,7 +23,7 @@ from evlcp_sdk.sim.truth import read_truth
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import summarize
-from evlcp_sdk.study.task import plan_of
+from evlcp_sdk.study.task import plan_campaign
 from evlcp_sdk.values import Events, Triggers
 from firmware_host.board.bank import read_masks
 from firmware_host.board.fleet import read_inventory
@@ -176,7 +176,7 @@ def kinds(folder, store):
         Kind("sites", "a.toml", SITES, load_sites),
         Kind("link", "a.toml", (EXAMPLES / "link.toml").read_bytes(), load_link),
         Kind("scene", "a.toml", (EXAMPLES / "scenes" / "street.toml").read_bytes(), load_scene),
-        Kind("campaign", "a.toml", (EXAMPLES / "campaigns" / "rates.toml").read_bytes(), plan_of),
+        Kind("campaign", "a.toml", (EXAMPLES / "campaigns" / "rates.toml").read_bytes(), plan_campaign),
         Kind("results", "a.sqlite", store, summary_file),
         Kind("symbols", "a.json", json.dumps({"symbols": symbols}).encode(), lambda p: read_symbols(p, None)),
         Kind("masks", "a.npy", masks.read_bytes(), lambda p: read_masks(p, link)),

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.errors import EvlcpError
-from evlcp_sdk.study.collect import collect
+from evlcp_sdk.study.collect import collect_results
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.store import Store
 from tests.fuzz.corpus import kinds
@@ -35,7 +35,7 @@ def store_of(folder):
     """A finished campaign's results file."""
     path = folder / "results.sqlite"
     with Store(path, create=True) as store:
-        collect(fake_plan(scenes=2, seeds=2), store, Inline(), run_fake)
+        collect_results(fake_plan(scenes=2, seeds=2), store, Inline(), run_fake)
     return path.read_bytes()
 
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.cli.report import as_markdown
-from evlcp_sdk.study.collect import collect
-from evlcp_sdk.study.comparison import of_campaign
+from evlcp_sdk.study.collect import collect_results
+from evlcp_sdk.study.comparison import compare_links
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.plan import Case, Job, Plan
-from evlcp_sdk.study.report import POSITION_HEAD, charts_of, page, position_rows
+from evlcp_sdk.study.report import POSITION_HEAD, draw_charts, position_rows, render_campaign
 from evlcp_sdk.study.store import Store
-from evlcp_sdk.study.summary import PAPER, Series, Summary, beside_paper, summarize
+from evlcp_sdk.study.summary import PAPER, Series, Summary, compare_with_paper, summarize
 from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.study.browser import CHROMIUM, Browser
 from tests.unit.study.fake import run_fake
@@ -48,7 +48,7 @@ def plan_of_two_methods() -> Plan:
 @pytest.fixture(scope="module")
 def summary(tmp_path_factory: pytest.TempPathFactory) -> Summary:
     with Store(tmp_path_factory.mktemp("report") / "a.sqlite", create=True) as store:
-        collect(plan_of_two_methods(), store, Inline(), run_fake)
+        collect_results(plan_of_two_methods(), store, Inline(), run_fake)
         return summarize(store)
 
 
@@ -67,7 +67,7 @@ def test_points_that_differ_in_distance_only_are_one_series(summary: Summary) ->
 
 
 def test_the_paper_is_held_beside_the_series_it_speaks_of(summary: Summary) -> None:
-    found = beside_paper(summary.series)
+    found = compare_with_paper(summary.series)
     by_name = {(c.reference.measure, c.reference.from_m, c.reference.clusters): c.series for c in found}
     assert by_name["rmse_m", 30, 16].startswith("30 km/h, 16")
     assert by_name["rmse_m", 30, 2].startswith("30 km/h, two")
@@ -75,7 +75,7 @@ def test_the_paper_is_held_beside_the_series_it_speaks_of(summary: Summary) -> N
     # Beside a bound stands the worst segment; the scenes are the harder, the farther.
     assert {c.from_m for c in found if c.reference.measure == "ber"} == {70}
     ours = Series({}, {"speed_kmh": 30}, summary.series[0].link, ())
-    assert beside_paper([ours]) == []
+    assert compare_with_paper([ours]) == []
 
 
 def test_a_smaller_figure_is_better_and_a_kept_bound_agrees(summary: Summary) -> None:
@@ -89,27 +89,27 @@ def test_a_smaller_figure_is_better_and_a_kept_bound_agrees(summary: Summary) ->
             (0.5, "agrees" if reference.bound else "better"),
             (1.25, "worse" if reference.bound else "agrees"),
         ):
-            tally = Tally.distance(reference.value * factor)
+            tally = Tally.of_distance(reference.value * factor)
             at = Statistics.of([(reference.from_m, tally)], tasks=1)
-            (one,) = beside_paper([Series({}, {"speed_kmh": 30}, link, (at,))], [reference])
+            (one,) = compare_with_paper([Series({}, {"speed_kmh": 30}, link, (at,))], [reference])
             assert one.verdict == verdict, (reference, factor)
 
 
 def test_a_limit_stands_above_the_paper_for_no_want_of_data(summary: Summary) -> None:
     """3.7 / 400 distances are a limit above the paper's .004, 3.7 / 1200 are none."""
-    at = Statistics.of([(m, Tally.distance(0.0)) for m in (30, 40, 50) for _ in range(400)], tasks=1)
+    at = Statistics.of([(m, Tally.of_distance(0.0)) for m in (30, 40, 50) for _ in range(400)], tasks=1)
     series = Series({"scene.speed_kmh": 30}, {"speed_kmh": 30}, summary.series[0].link, (at,))
-    (gross,) = (one for one in charts_of(replace(summary, series=(series,))) if one.id == "gross")
+    (gross,) = (one for one in draw_charts(replace(summary, series=(series,))) if one.id == "gross")
     gross.markup()
     (shown,) = [text.splitlines()[1] for *_, text, _ in gross.labels if text.startswith(series.name)]
     assert shown.startswith("30 to 60 m: below 0.0031")
 
 
 def test_the_page_tells_everything(summary: Summary) -> None:
-    text = page(summary)
+    text = render_campaign(summary)
     assert summary.plan.digest in text
     assert "<h1>two methods &lt;/script&gt;</h1>" in text
-    verdicts = [one.verdict for one in beside_paper(summary.series)]
+    verdicts = [one.verdict for one in compare_with_paper(summary.series)]
     assert text.count('<span class="no">worse</span>') == verdicts.count("worse")
     assert text.count('<span class="yes">better</span>') == verdicts.count("better")
     assert "arXiv 2510.17203" in text
@@ -123,8 +123,8 @@ def test_the_page_tells_everything(summary: Summary) -> None:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
 def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) -> None:
-    (tmp_path / "report.html").write_text(page(summary), encoding="utf-8")
-    (tmp_path / "compare.html").write_text(of_campaign(summary).to_html(), encoding="utf-8")
+    (tmp_path / "report.html").write_text(render_campaign(summary), encoding="utf-8")
+    (tmp_path / "compare.html").write_text(compare_links(summary).to_html(), encoding="utf-8")
     with Browser(tmp_path / "profile") as browser:
         browser.open(tmp_path / "report.html")
         drawn = browser.value(
@@ -169,12 +169,12 @@ def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) ->
 
 def test_what_became_of_positions_is_a_table_of_its_own(summary: Summary, tmp_path: Path) -> None:
     assert position_rows(summary) == []
-    assert "<h2>Positions</h2>" not in page(summary)
+    assert "<h2>Positions</h2>" not in render_campaign(summary)
     scenes = tuple(Case({"variant": v}, v, v) for v in ("right", "off"))
     plan = Plan("p", scenes, (Case({}, 0, {}),), (0,))
-    fixes = [Tally.fix(0.1, 2.0, protected=True), Tally.fix(0.3, 20.0, excluded=True)]
+    fixes = [Tally.of_fix(0.1, 2.0, protected=True), Tally.of_fix(0.3, 20.0, excluded=True)]
     tallies = {
-        "right": [*fixes, Tally.tracked(0.2, 3.0, 0.1, 6.0)],
+        "right": [*fixes, Tally.of_track_point(0.2, 3.0, 0.1, 6.0)],
         "off": [Tally(fixes_refused=3, fixes_contradicted=2)],
     }
 
@@ -182,12 +182,12 @@ def test_what_became_of_positions_is_a_table_of_its_own(summary: Summary, tmp_pa
         return [(task.id, Statistics.of((40, t) for t in tallies[task.scene])) for task in job.tasks]
 
     with Store(tmp_path / "p.sqlite", create=True) as store:
-        collect(plan, store, Inline(), run)
+        collect_results(plan, store, Inline(), run)
         found = summarize(store)
     right, off = position_rows(found)
     assert len(right) == len(off) == len(POSITION_HEAD)
     assert right[1:8] == ("2 of 2", "0", "100.0%", "1", "0.105, 0.305", "11", "1")
     assert right[8:] == ("1", "1", "0", "0.200", "3", "0.100", "6")
     assert off[1:5] == ("0 of 3", "2", "0.0%", "0")
-    assert "<h2>Positions</h2>" in page(found)
+    assert "<h2>Positions</h2>" in render_campaign(found)
     assert "| right | 2 of 2 | 0 | 100.0% |" in as_markdown(found)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from evlcp_sdk.study.collect import collect
+from evlcp_sdk.study.collect import collect_results
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.store import Store
 from tests.unit.study.fake import fake_plan, run_fake
@@ -49,7 +49,7 @@ def workplace(tmp_path: Path, demo_raw: Path, monkeypatch: pytest.MonkeyPatch) -
     (tmp_path / "campaign.toml").write_text(CAMPAIGN)
     (tmp_path / "leds.bin").write_bytes(bytes(20))
     with Store(tmp_path / "results.sqlite", create=True) as store:
-        collect(fake_plan(1, 1, 1), store, Inline(), run_fake)
+        collect_results(fake_plan(1, 1, 1), store, Inline(), run_fake)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -16,7 +16,7 @@ from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.study.frames import frames_of
-from evlcp_sdk.study.match import match
+from evlcp_sdk.study.match import match_frames
 from evlcp_sdk.testing.views import ideal_presence, ideal_sums
 from evlcp_sdk.values import Events
 
@@ -107,7 +107,7 @@ def test_other_codes_at_50_m_at_night(name):
     overrides = ["duration_s=0.09", "motion.distance_m=50"]
     with simulate("night", seed=1, link=link, overrides=overrides) as source:
         packets = receiver.feed(Events.concat(list(source.chunks()))) + receiver.close()
-    matched = match(frames_of(packets), source.truth)
+    matched = match_frames(frames_of(packets), source.truth)
     (sent,), (pairs,) = matched.bars, matched.pairs
     most_lost = 2 * (link.packet.pilot_every - 1)
     assert matched.unmatched == 0

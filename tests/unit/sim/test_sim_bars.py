@@ -24,7 +24,7 @@ from evlcp_sdk.sim import BarSpec, Truth, load_scene, resolve_scene, sites_of, t
 from evlcp_sdk.sim.light import BarLight, sources_of
 from evlcp_sdk.sim.scene import LensSpec, links_of
 from evlcp_sdk.simulated import simulate
-from evlcp_sdk.study.measure import message_tallies
+from evlcp_sdk.study.measure import tally_messages
 from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.values import Packet
 from tests.unit.sim.scenes import every, still_scene
@@ -156,7 +156,7 @@ def test_a_campaign_counts_messages() -> None:
     coder = load_link().block_coder()
 
     def total(packets: list[Packet], known: Truth = known) -> tuple[int, int, int]:
-        tally = Tally.together(t for _, t in message_tallies(packets, known, coder))
+        tally = Tally.sum(t for _, t in tally_messages(packets, known, coder))
         return tally.messages_sent, tally.messages_found, tally.messages_wrong
 
     # Packets begin 4.6, 39.2, 73.8, 108.4 and 143 ms after the scene: four are on air as a whole.
@@ -165,7 +165,7 @@ def test_a_campaign_counts_messages() -> None:
     (bar,) = known.bars
     wrong = replace(known, bars=(replace(bar, symbols=bar.symbols ^ 1),))
     assert total(packets, wrong)[1:] == (0, sum(p.block is not None for p in packets))
-    assert message_tallies([], replace(known, bars=(replace(bar, payload="symbols"),)), coder) == []
+    assert tally_messages([], replace(known, bars=(replace(bar, payload="symbols"),)), coder) == []
 
 
 def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import EvlcpError
-from evlcp_sdk.study.collect import collect
+from evlcp_sdk.study.collect import collect_results
 from evlcp_sdk.study.jobs import Processes
 from evlcp_sdk.study.plan import Case, Job, Plan, StopRule
 from evlcp_sdk.study.store import Store
@@ -55,7 +55,7 @@ def fake_statistics(scene: int, link: int, seed: int) -> Statistics:
             errors = sum(rng.random() < 0.01 * (scene + 1) for _ in range(96))
             error_m = rng.gauss(0, 0.05 * (scene + 1) * (link + 1))
             tallies.append((begin, Tally(frames_found=1, bits=96, bit_errors=errors)))
-            tallies.append((begin, Tally.distance(error_m, 0.05)))
+            tallies.append((begin, Tally.of_distance(error_m, 0.05)))
     counts = {"tasks": 1, "events": rng.randrange(10_000), "duration_us": 100_000, "packets": 2, "rows": 20}
     return Statistics.of(tallies, **counts)
 
@@ -63,4 +63,4 @@ def fake_statistics(scene: int, link: int, seed: int) -> Statistics:
 if __name__ == "__main__":
     # The process that the kill tests kill.
     with Store(Path(sys.argv[1]), create=True) as file:
-        collect(fake_plan(8, 2, 4, seconds=0.02), file, Processes(2), run_fake)
+        collect_results(fake_plan(8, 2, 4, seconds=0.02), file, Processes(2), run_fake)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
-from evlcp_sdk.study.collect import Counted, Progress, collect
+from evlcp_sdk.study.collect import PointProgress, Progress, collect_results
 from evlcp_sdk.study.jobs import DaskCluster, Executor, Inline, Processes
 from evlcp_sdk.study.plan import StopRule
 from evlcp_sdk.study.store import Store
@@ -27,9 +27,10 @@ from tests.unit.test_signals import start
 def collect_plan(plan, path, executor=None, watch=lambda _: None) -> tuple[Progress, list[Statistics]]:
     """How a collection ended, and what counts of each point in its store."""
     with Store(path, create=True) as store:
-        progress = collect(plan, store, executor or Inline(), run_fake, watch)
-        results = store.results()
-    return progress, [sum(Counted(p.tasks, plan.rule, results).recordings, Statistics()) for p in plan.points]
+        progress = collect_results(plan, store, executor or Inline(), run_fake, watch)
+        results = store.read_results()
+    points = [PointProgress(point.tasks, plan.rule, results) for point in plan.points]
+    return progress, [sum(point.recordings, Statistics()) for point in points]
 
 
 @pytest.mark.parametrize("rule", [StopRule(), StopRule(max_bits=9000, max_errors=60)])
@@ -60,13 +61,13 @@ def test_a_finished_campaign_runs_nothing_and_a_grown_one_the_rest(tmp_path: Pat
         return results
 
     with Store(tmp_path / "a.sqlite", create=True) as store:
-        collect(fake_plan(), store, Inline(), run)
+        collect_results(fake_plan(), store, Inline(), run)
         assert len(ran) == 40
         with pytest.raises(ConfigError, match="holds the campaign 'fake', not 'other'"):
-            store.adopt(replace(fake_plan(), name="other"))
-        collect(fake_plan(), store, Inline(), run)
+            store.save_plan(replace(fake_plan(), name="other"))
+        collect_results(fake_plan(), store, Inline(), run)
         assert len(ran) == 40
-        collect(fake_plan(scenes=6, seeds=5), store, Inline(), run)
+        collect_results(fake_plan(scenes=6, seeds=5), store, Inline(), run)
     assert len(ran) == len(set(ran)) == 60
     # A rule that is tightened counts less of what is there.
     plan = fake_plan(rule=StopRule(max_bits=2500))
@@ -111,7 +112,7 @@ def count_kept(store: Path) -> int:
         return 0
     try:
         with Store(store) as file:
-            return len(file.results())
+            return len(file.read_results())
     except InputError:
         return 0
 
@@ -158,7 +159,7 @@ def test_what_is_no_store_or_cannot_be_opened_is_refused(tmp_path: Path) -> None
         Store(tmp_path / "no" / "such" / "a.sqlite", create=True)
     new = Store(tmp_path / "new.sqlite", create=True)
     with new, pytest.raises(InputError, match="no campaign has started"):
-        new.plan()
+        new.read_plan()
 
 
 class Cluster:

@@ -12,21 +12,21 @@ import pytest
 from markupsafe import Markup, escape
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.study.collect import collect
+from evlcp_sdk.study.collect import collect_results
 from evlcp_sdk.study.compare import load_variants
 from evlcp_sdk.study.comparison import (
     BOUND_NAME,
     COLUMNS,
     STAGES,
     Comparison,
-    Measured,
+    Measurement,
+    ProcessingTime,
     Table,
-    Times,
-    of_campaign,
+    compare_links,
     total_of,
 )
 from evlcp_sdk.study.jobs import Inline
-from evlcp_sdk.study.report import comparison_rows
+from evlcp_sdk.study.report import paper_rows
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import PAPER, Figure, PaperComparison, Reference, summarize
 from evlcp_sdk.study.tally import Statistics, Tally
@@ -35,29 +35,29 @@ from tests.unit.study.fake import fake_plan, run_fake
 
 
 def errors(*errors_m: float) -> Tally:
-    return Tally.together(map(Tally.distance, errors_m))
+    return Tally.sum(map(Tally.of_distance, errors_m))
 
 
 ERRORS = errors(0.1, -0.2, 0.6)
 FILTERED = Tally(filtered=2, filtered_squares_nm2=29 * 10**14)
 
 
-def make_measured(error=ERRORS, filtered=FILTERED, times=None, **changes: int) -> Measured:
+def make_measured(error=ERRORS, filtered=FILTERED, times=None, **changes: int) -> Measurement:
     """A variant with truth and a tracking filter."""
     tally = Tally(**({"frames_sent": 100, "frames_found": 88, "bits": 8448, "bit_errors": 3} | changes))
     counts = {"packets": 9, "rows": 90, "unmatched": 2, "stated": 2, "sigma_squares_nm2": 10**17}
     took = {"frame_us": (500.0, 700.0, 9000.0), "recorded_s": 0.4, "cpu_s": 0.2}
     took |= {"stage_us": dict.fromkeys(STAGES, (100.0, 200.0, 300.0))}
     counted = Statistics.of([(30, tally), (40, error), (40, filtered)], **counts)
-    return Measured({"REC.raw": counted}, Times(**(took | (times or {}))))
+    return Measurement({"REC.raw": counted}, ProcessingTime(**(took | (times or {}))))
 
 
 UNKNOWN = Statistics(rows=5, packets=1, stated=1, sigma_squares_nm2=4 * 10**16)
-BLIND = Measured({"BLIND.raw": UNKNOWN}, Times(recorded_s=0.1, cpu_s=0.1))
+BLIND = Measurement({"BLIND.raw": UNKNOWN}, ProcessingTime(recorded_s=0.1, cpu_s=0.1))
 """A variant on a recording without truth."""
 
 
-def table(*rows: Measured, bound: float | None = 0.05) -> Table:
+def table(*rows: Measurement, bound: float | None = 0.05) -> Table:
     names = [f"v{n}" for n in range(len(rows))]
     return Table("REC.raw", dict(zip(names, rows, strict=True)), () if bound is None else (bound,))
 
@@ -79,27 +79,27 @@ def test_figures_by_hand() -> None:
     assert both.times.frame_us == m.times.frame_us * 2
     assert both.times.stage_us["ranging"] == m.times.stage_us["ranging"] * 2
     for column in COLUMNS:
-        assert column.cell(Measured()) in ("-", "0")
-        assert column.rank is None or math.isnan(column.rank(Measured()))
+        assert column.cell(Measurement()) in ("-", "0")
+        assert column.rank is None or math.isnan(column.rank(Measurement()))
 
 
 def test_the_best_are_marked() -> None:
     other = make_measured(errors(-0.2, 0.15, 0.7), times={"frame_us": (800.0,), "cpu_s": 0.1}, bit_errors=2)
-    best = table(make_measured(errors(0.5, -0.6, 0.0)), other).best()
+    best = table(make_measured(errors(0.5, -0.6, 0.0)), other).find_best()
     # As many frames: both. BER by its value: the intervals of 2 and 3 errors overlap.
     shared = {"found_share", "filtered_rmse_m"}
     assert best[0] == shared | {"us_per_frame", "bias_m"}
     assert best[1] == shared | {"ber", "rmse_m", "gross_share", "times_real_time"}
     # Two have a BER, only one has distances.
-    alone, other_keys = table(make_measured(), make_measured(Tally(), Tally())).best()
+    alone, other_keys = table(make_measured(), make_measured(Tally(), Tally())).find_best()
     assert "ber" in alone & other_keys
     assert not (alone | other_keys) & {"rmse_m", "bias_m", "gross_share", "filtered_rmse_m"}
-    assert table(make_measured()).best() == (frozenset(),)
-    assert table(BLIND, BLIND).best() == (frozenset({"times_real_time"}),) * 2
+    assert table(make_measured()).find_best() == (frozenset(),)
+    assert table(BLIND, BLIND).find_best() == (frozenset({"times_real_time"}),) * 2
 
 
 def rows_of(one: Table) -> list[dict[str, str]]:
-    head, lines = one.cells()
+    head, lines = one.format_rows()
     assert all(best == text.endswith("*") for line in lines for text, best in line)
     return [dict(zip(head, (text for text, _ in line), strict=True)) for line in lines]
 
@@ -157,7 +157,7 @@ def test_json_csv_and_html_parse_back() -> None:
     assert "<h1>Variants compared: v0 and v1 on 2 recordings</h1>" in page
     assert "&lt;brackets&gt;" in page
     for one in whole.tables:
-        for text, best in (cell for line in one.cells()[1] for cell in line):
+        for text, best in (cell for line in one.format_rows()[1] for cell in line):
             assert (Markup("<b>{}</b>").format(text) if best else escape(text)) in page
 
 
@@ -195,9 +195,9 @@ def test_variants_share_what_is_set_for_all() -> None:
 
 def test_a_campaign_is_a_table_a_scene(tmp_path: Path) -> None:
     with Store(tmp_path / "r.sqlite", create=True) as store:
-        collect(fake_plan(scenes=2), store, Inline(), run_fake)
+        collect_results(fake_plan(scenes=2), store, Inline(), run_fake)
         summary = summarize(store)
-    whole = of_campaign(summary)
+    whole = compare_links(summary)
     assert [one.name for one in whole.tables] == ["distance 30 m", "distance 40 m", "all scenes"]
     assert list(whole.variants) == ["link 0", "link 1"]
     counted = [series.statistics for series in summary.series]
@@ -209,8 +209,8 @@ def test_a_campaign_is_a_table_a_scene(tmp_path: Path) -> None:
     assert "us/frame" not in whole.legend
     assert "x real time" not in whole.legend
     # Twice the error in every frame.
-    assert "rmse_m" in whole.tables[2].best()[0]
-    assert "packets" in whole.tables[0].cells()[0]
+    assert "rmse_m" in whole.tables[2].find_best()[0]
+    assert "packets" in whole.tables[0].format_rows()[0]
 
 
 PAGE = (ROOT / "docs" / "paper.md").read_text()
@@ -227,7 +227,7 @@ def beside(table: dict[str, Any]) -> PaperComparison:
     "table", RESULT["paper"], ids=lambda t: f"{t['measure']}-{t['from_m']}-{t['series']}"
 )
 def test_every_comparison_is_on_the_page(table: dict[str, Any]) -> None:
-    (row,) = comparison_rows([beside(table)])
+    (row,) = paper_rows([beside(table)])
     assert table["verdict"] == beside(table).verdict
     assert f"| {' | '.join(row)} |" in PAGE
 

@@ -20,7 +20,7 @@ from evlcp_sdk.specs import to_toml_value
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.study.tally import Tally
-from evlcp_sdk.study.task import plan_of
+from evlcp_sdk.study.task import plan_campaign
 from tests.conftest import Brings
 
 Settings = dict[str, Any]
@@ -198,7 +198,7 @@ def test_links_that_share_what_is_on_air_share_a_rendering(evlcp, tmp_path: Path
         'paper = {}\nother-ranging = { ranging.id = "poc" }\nslow = { air.chip_rate_hz = 5000.0 }\n'
         'other = { pilots.id = "barker13" }\nlike = { pilots.id = "barker13", decoding.id = "ml-soft" }\n'
     )
-    plan = plan_of(tmp_path / "c.toml")
+    plan = plan_campaign(tmp_path / "c.toml")
     assert [len(job.tasks) for job in plan.jobs] == [2, 1, 2] * 2
     assert [job.seed for job in plan.jobs] == [0] * 3 + [1] * 3
     tasks = [task for job in plan.jobs for task in job.tasks]

@@ -27,8 +27,8 @@ from evlcp_sdk.sim import (
 from evlcp_sdk.sim.scene import WorldSpec
 from evlcp_sdk.sim.world import attitude_log
 from evlcp_sdk.study.frames import FrameRow, read_frames
-from evlcp_sdk.study.match import check_link, match, nearest_bar
-from evlcp_sdk.study.measure import position_tallies, statistics_of
+from evlcp_sdk.study.match import check_link, find_nearest_bar, match_frames
+from evlcp_sdk.study.measure import statistics_of, tally_positions
 from evlcp_sdk.study.score import score_frames
 from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.values import Packet
@@ -193,14 +193,14 @@ def test_of_two_bars_in_one_place_the_one_that_shows_is_meant() -> None:
     truth = truth_of(Scene(bars=(old, new)))
     for t_us, number in ((50_000.0, 0), (150_000.0, 1)):
         x, y = (float(np.interp(t_us, truth.t_us, axis)) for axis in truth.bars[0].centre_px.T)
-        assert nearest_bar(truth.bars, truth, t_us, x + 3.0, y) == (number, pytest.approx(3.0))
+        assert find_nearest_bar(truth.bars, truth, t_us, x + 3.0, y) == (number, pytest.approx(3.0))
     rows: list[FrameRow] = []
-    for bar, until_us in zip(match([], truth, road=False).bars, (1e5, 1e6), strict=True):
+    for bar, until_us in zip(match_frames([], truth, road=False).bars, (1e5, 1e6), strict=True):
         for t_us in bar.start_us[(bar.start_us < until_us) & (bar.start_us >= until_us - 9e5)].tolist():
             x, y = (float(np.interp(t_us, truth.t_us, axis)) for axis in truth.bars[0].centre_px.T)
             rows.append(FrameRow(0, t_us, (0,) * 16, math.nan, math.nan, math.nan, x, y))
     for road, old_ones in ((True, 28), (False, 29)):
-        found = match(rows, truth, road=road)
+        found = match_frames(rows, truth, road=road)
         assert (found.unmatched, *map(len, found.pairs)) == (0, old_ones, len(rows) - 29)
 
 
@@ -300,8 +300,8 @@ def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
     log = attitude_log(exact, 0, simulation.path)
     if log is not None:
         log = replace(log, heading_sigma_deg=np.full(len(log.t_us), WorldSpec().heading_sigma_deg))
-    tallies = position_tallies(packets, truth, load_link(), log)
-    total = Tally.together(tally for _, tally in tallies)
+    tallies = tally_positions(packets, truth, load_link(), log)
+    total = Tally.sum(tally for _, tally in tallies)
     assert {begin for begin, _ in tallies} == {40}
     if attitude == "none":
         assert (total.fixes, total.fixes_refused, total.fixes_contradicted) == (0, len(tallies), 0)
@@ -315,7 +315,7 @@ def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
     # A truth 1e-4 degrees further north is 11.1 m off.
     path = truth.camera_path
     moved = replace(truth, camera_path={**path, "latitude_deg": path["latitude_deg"] + 1e-4})
-    total = Tally.together(tally for _, tally in position_tallies(packets, moved, load_link(), log))
+    total = Tally.sum(tally for _, tally in tally_positions(packets, moved, load_link(), log))
     assert total.position_rmse_m == pytest.approx(11.1, abs=0.1)
     assert total.position_nees > 20
     assert total.track_rmse_m == pytest.approx(11.1, abs=0.1)

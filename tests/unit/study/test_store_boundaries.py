@@ -10,11 +10,11 @@ import pytest
 
 from evlcp_sdk.cli.report import as_markdown, show_tables
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.study.collect import collect
-from evlcp_sdk.study.comparison import of_campaign
+from evlcp_sdk.study.collect import collect_results
+from evlcp_sdk.study.comparison import compare_links
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.plan import Case, Plan
-from evlcp_sdk.study.report import charts_of, page
+from evlcp_sdk.study.report import draw_charts, render_campaign
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import Summary, summarize
 from tests.unit.mutants import mutants, refusal
@@ -27,7 +27,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A finished campaign, nothing of it left in a log."""
     path = tmp_path_factory.mktemp("finished") / "a.sqlite"
     with Store(path, create=True) as store:
-        collect(fake_plan(scenes=2, seeds=2), store, Inline(), run_fake)
+        collect_results(fake_plan(scenes=2, seeds=2), store, Inline(), run_fake)
     return path.read_bytes()
 
 
@@ -98,7 +98,7 @@ def test_a_report_changes_nothing(results: Path) -> None:
 
 def test_what_still_runs_is_read_from_its_log(results: Path) -> None:
     with Store(results, create=True) as writer:
-        collect(fake_plan(scenes=3, seeds=3), writer, Inline(), run_fake)
+        collect_results(fake_plan(scenes=3, seeds=3), writer, Inline(), run_fake)
         assert Path(f"{results}-wal").stat().st_size
         assert read(results).done == 18
     assert read(results).done == 18
@@ -109,12 +109,12 @@ def draw_page(summary: Summary) -> Elements:
     json.dumps(summary.to_dict(), allow_nan=False)
     show_tables(summary)
     as_markdown(summary)
-    charts_of(summary)
-    compared = of_campaign(summary)
+    draw_charts(summary)
+    compared = compare_links(summary)
     compared.to_json()
     compared.to_csv()
     assert_plain(Elements(compared.to_html()))
-    return assert_plain(Elements(page(summary)))
+    return assert_plain(Elements(render_campaign(summary)))
 
 
 def assert_plain(found: Elements) -> Elements:
@@ -185,7 +185,7 @@ def test_hostile_names_are_shown_as_they_are(tmp_path: Path, capsys: pytest.Capt
         environment={HOSTILE: HOSTILE},
     )
     with Store(tmp_path / "a.sqlite", create=True) as store:
-        collect(plan, store, Inline(), run_fake)
+        collect_results(plan, store, Inline(), run_fake)
     found = draw_page(read(tmp_path / "a.sqlite"))
     assert found.text.count(HOSTILE) > 8
     assert HOSTILE in capsys.readouterr().out

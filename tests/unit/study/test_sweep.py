@@ -13,7 +13,7 @@ from evlcp_sdk.sim.scene import links_of
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import summarize
-from evlcp_sdk.study.task import plan_of, run_job
+from evlcp_sdk.study.task import plan_campaign, run_job
 from tests.conftest import ROOT
 
 CAMPAIGN = """
@@ -49,8 +49,8 @@ def test_from_a_file_to_figures(evlcp, campaign: Path, tmp_path: Path) -> None:
     assert (done.code, done.err) == (0, "")
     assert "short: 4 of 4 tasks, 4 of 4 points" in done.out
     with Store(results) as store:
-        found = store.results()
-    for outcome in Inline().run(run_job, plan_of(campaign).jobs[:1]):
+        found = store.read_results()
+    for outcome in Inline().run(run_job, plan_campaign(campaign).jobs[:1]):
         assert outcome.value is not None
         assert all(found[task] == one for task, one in outcome.value), "another process found something else"
     for statistics in found.values():
@@ -85,7 +85,7 @@ def test_bad_campaigns_are_one_line(evlcp, campaign, tmp_path, overrides, messag
 
 
 def test_a_link_of_a_scene_is_a_file_beside_the_campaign(campaign: Path, tmp_path: Path) -> None:
-    job = plan_of(campaign).jobs[0]
+    job = plan_campaign(campaign).jobs[0]
     with pytest.raises(ConfigError, match="not those of the campaign's plan"):
         run_job(replace(job, environment={"source": "0" * 64}))
     (tmp_path / "scenes").mkdir()
@@ -94,15 +94,15 @@ def test_a_link_of_a_scene_is_a_file_beside_the_campaign(campaign: Path, tmp_pat
     for base in ("drive-30kmh", "scenes/mine.toml"):
         campaign.write_text(CAMPAIGN.replace('"drive-30kmh"', f'"{base}"'))
         for key in ("link", "bars.link", "bars.0.link"):
-            scene = plan_of(campaign, [f"scene.{key}=link.toml"]).scenes[0].value
+            scene = plan_campaign(campaign, [f"scene.{key}=link.toml"]).scenes[0].value
             assert links_of(scene)[0].air.chip_rate_hz == 5000.0
     with pytest.raises(ConfigError, match=r"other\.toml: cannot be read"):
-        plan_of(campaign, ["scene.link=other.toml"])
+        plan_campaign(campaign, ["scene.link=other.toml"])
 
 
 def test_files_of_a_scene_count_by_what_they_hold(campaign: Path, tmp_path: Path) -> None:
     def ids() -> tuple[str, ...]:
-        return plan_of(campaign, ["scene.motion.path_file=path.csv"]).points[0].tasks
+        return plan_campaign(campaign, ["scene.motion.path_file=path.csv"]).points[0].tasks
 
     (tmp_path / "scene.toml").write_text("duration_s = 0.05\n")
     campaign.write_text(CAMPAIGN.replace('"drive-30kmh"', '"scene.toml"'))
@@ -116,7 +116,8 @@ def test_files_of_a_scene_count_by_what_they_hold(campaign: Path, tmp_path: Path
 
 
 def test_the_shipped_campaigns_are_read() -> None:
-    demo, paper = plan_of(demo_campaign()), plan_of(ROOT / "examples" / "campaigns" / "paper.toml")
+    campaigns = (demo_campaign(), ROOT / "examples" / "campaigns" / "paper.toml")
+    demo, paper = map(plan_campaign, campaigns)
     assert len(demo.jobs) == 20
     assert {round(s.identity["motion"]["speed_mps"] * 3.6, 1) for s in paper.scenes} == {20.0, 30.0, 40.0}
     assert [k.labels["variant"] for k in paper.links] == ["16 clusters", "two clusters"]
@@ -124,7 +125,7 @@ def test_the_shipped_campaigns_are_read() -> None:
     guesses = {json.dumps([s.identity["sensor"], s.identity["lens"]]) for s in [*demo.scenes, *paper.scenes]}
     assert len(guesses) == 1
     # A road is swept in steps, by the default link and the paper's.
-    plan = plan_of(ROOT / "examples" / "campaigns" / "road.toml")
+    plan = plan_campaign(ROOT / "examples" / "campaigns" / "road.toml")
     assert [link.labels["variant"] for link in plan.links] == ["default", "paper"]
     assert plan.links[0].identity["digest"] == resolve({}).digest
     names = [str(scene.labels["variant"]).split(": ") for scene in plan.scenes]

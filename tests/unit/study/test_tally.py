@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, strategies as st
 from scipy.stats import binomtest, t
 
-from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, measure, ratio_interval
+from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, measure_figure, ratio_interval
 from evlcp_sdk.study.tally import Statistics, Tally, segment_of
 
 TALLIES = st.one_of(
     st.just(Tally(frames_sent=1)),
     st.builds(Tally, frames_found=st.just(1), bits=st.just(96), bit_errors=st.integers(0, 96)),
-    st.builds(Tally.distance, st.floats(-20, 20), st.one_of(st.just(math.nan), st.floats(0, 2))),
-    st.builds(Tally.fix, st.floats(0, 20), st.floats(0, 1e15)),
+    st.builds(Tally.of_distance, st.floats(-20, 20), st.one_of(st.just(math.nan), st.floats(0, 2))),
+    st.builds(Tally.of_fix, st.floats(0, 20), st.floats(0, 1e15)),
 )
 STATISTICS = st.builds(
     Statistics.of,
@@ -37,7 +37,7 @@ def test_sums_do_not_depend_on_order_and_json_keeps_them(a: Statistics, b: Stati
 
 def test_figures_are_those_of_the_errors() -> None:
     errors = np.random.default_rng(1).normal(0.03, 0.4, 500)
-    tally = sum((Tally.distance(float(e), 0.4) for e in errors), Tally())
+    tally = sum((Tally.of_distance(float(e), 0.4) for e in errors), Tally())
     assert tally.rmse_m == pytest.approx(math.sqrt((errors**2).mean()), abs=1e-9)
     assert tally.bias_m == pytest.approx(errors.mean(), abs=1e-9)
     assert tally.worst_m == pytest.approx(abs(errors).max(), abs=1e-9)
@@ -50,17 +50,17 @@ def test_figures_are_those_of_the_errors() -> None:
     some = Tally(bits=96, bit_errors=3, visible=20, erased=4, hidden=8, claimed=2)
     assert (some.ber, some.erased_share, some.claimed_share) == (3 / 96, 0.2, 0.25)
     # Errors at the edge count, and far ones have a bin.
-    assert [Tally.distance(error_m).gross for error_m in (-0.5, 0.499999)] == [1, 0]
-    assert [Tally.distance(error_m).histogram for error_m in (1e4, -1e4)] == [{150: 1}, {-150: 1}]
+    assert [Tally.of_distance(error_m).gross for error_m in (-0.5, 0.499999)] == [1, 0]
+    assert [Tally.of_distance(error_m).histogram for error_m in (1e4, -1e4)] == [{150: 1}, {-150: 1}]
     assert segment_of(50.0) == 50
     # A sigma of 0 is wrong beyond all measure, none counts not at all.
-    assert Tally.distance(0.1, 0.0).nees == 1e12
-    assert Tally.distance(0.1).with_sigma == 0
+    assert Tally.of_distance(0.1, 0.0).nees == 1e12
+    assert Tally.of_distance(0.1).with_sigma == 0
 
 
 def test_positions_have_quantiles() -> None:
     errors_m = np.random.default_rng(0).exponential(0.1, 999)
-    total = sum((Tally.fix(float(e), 3.0) for e in errors_m), Tally(fixes_refused=2))
+    total = sum((Tally.of_fix(float(e), 3.0) for e in errors_m), Tally(fixes_refused=2))
     assert (total.fixes, total.fixes_refused) == (999, 2)
     assert total.position_rmse_m == pytest.approx(np.sqrt((errors_m**2).mean()), rel=1e-4)
     assert total.position_nees == pytest.approx(3.0)
@@ -75,7 +75,7 @@ def test_positions_have_quantiles() -> None:
 def test_what_is_silent_and_not_covered_is_counted() -> None:
     kinds = {14.1: "", 14.2: "", 1.0: "protected beyond"}
     kinds |= {98.0: "protected", 99.0: "protected beyond excluded"}
-    fixes = (Tally.fix(0.1, nees, **dict.fromkeys(kind.split(), True)) for nees, kind in kinds.items())
+    fixes = (Tally.of_fix(0.1, nees, **dict.fromkeys(kind.split(), True)) for nees, kind in kinds.items())
     total = sum(fixes, Tally(fixes_refused=9))
     assert (total.fixes, total.fixes_silent, total.fixes_uncovered) == (5, 3, 2)
     assert (total.fixes_excluded, total.fixes_protected, total.fixes_beyond) == (1, 3, 2)
@@ -84,7 +84,7 @@ def test_what_is_silent_and_not_covered_is_counted() -> None:
 
 
 def test_a_track_has_errors_as_filtered_and_as_smoothed() -> None:
-    total = Tally.tracked(0.3, 4.0, 0.1, 2.0) + Tally.tracked(0.4, 2.0, 0.1, 4.0)
+    total = Tally.of_track_point(0.3, 4.0, 0.1, 2.0) + Tally.of_track_point(0.4, 2.0, 0.1, 4.0)
     assert total.track_rmse_m == pytest.approx(math.sqrt((0.09 + 0.16) / 2))
     assert (total.track_nees, total.smoothed_nees) == pytest.approx((3.0, 3.0))
     assert total.smoothed_rmse_m == pytest.approx(0.1)
@@ -111,7 +111,7 @@ def test_intervals_of_bursts_cover(recordings: int) -> None:
 
 def test_the_interval_of_a_root_mean_square_is_the_root_of_the_ratios() -> None:
     squares = [v * 10**20 for v in (4, 9, 30, 8, 5)]
-    found = measure([Tally(ranged=60, squares_nm2=v) for v in squares], "rmse_m")
+    found = measure_figure([Tally(ranged=60, squares_nm2=v) for v in squares], "rmse_m")
     ends = 1e-9 * np.sqrt(ratio_interval(squares, [60] * 5))
     assert (found.low, found.high) == pytest.approx(tuple(ends))
     assert found.high > 1
@@ -143,26 +143,26 @@ def test_few_recordings_have_a_range_and_one_has_nothing() -> None:
     low, high = ratio_interval([40, 41, 40, 41, 900], [6000] * 5)
     assert 0 < low < 1062 / 30_000 < high < 100 * 1062 / 30_000
     some = [Tally(bits=1000, bit_errors=k, frames_found=10) for k in (10, 20, 60)]
-    few = measure(some, "ber")
+    few = measure_figure(some, "ber")
     assert (few.value, few.low, few.high, few.recordings) == (0.03, 0.01, 0.06, 3)
     assert few.interval(".2f") == "(0.01, 0.06)"
-    alone = measure(some[:1], "ber")
+    alone = measure_figure(some[:1], "ber")
     assert math.isnan(alone.low)
     assert alone.interval(".2f") == ""
     # A recording without data is none.
-    assert measure([*some, Tally()], "ber") == few
-    assert measure([], "rmse_m").count == 0
-    assert math.isnan(measure([Tally()], "gross_share").value)
-    enough = measure(some * 2, "ber")
+    assert measure_figure([*some, Tally()], "ber") == few
+    assert measure_figure([], "rmse_m").count == 0
+    assert math.isnan(measure_figure([Tally()], "gross_share").value)
+    enough = measure_figure(some * 2, "ber")
     assert enough.low < 0.03 < enough.high
     assert enough.interval(".2f").startswith("[")
 
 
 def test_without_errors_there_is_a_limit_by_frames() -> None:
-    none = measure([Tally(bits=960, frames_found=10)] * 8, "ber")
-    assert (none.value, none.low, none.none) == (0, 0, True)
+    none = measure_figure([Tally(bits=960, frames_found=10)] * 8, "ber")
+    assert (none.value, none.low, none.is_zero) == (0, 0, True)
     assert none.high == binomtest(0, 80).proportion_ci().high
-    all_found = measure([Tally(frames_sent=10, frames_found=10)] * 8, "found_share")
+    all_found = measure_figure([Tally(frames_sent=10, frames_found=10)] * 8, "found_share")
     assert (all_found.value, all_found.high) == (1, 1)
     assert all_found.low == binomtest(80, 80).proportion_ci().low
 
@@ -170,7 +170,7 @@ def test_without_errors_there_is_a_limit_by_frames() -> None:
 def test_a_share_near_one_is_bounded_by_one() -> None:
     names = ("frames_sent", "frames_found", "messages_sent", "messages_found")
     some = [Tally(**dict(zip(names, 2 * (100, 100 - k), strict=True))) for k in (0, 0, 1, 0, 9, 0)]
-    found, lost = measure(some, "found_share"), measure(some, "lost_share")
+    found, lost = measure_figure(some, "found_share"), measure_figure(some, "lost_share")
     assert 0 < found.low < found.value < found.high <= 1
     assert lost.value == pytest.approx(1 - found.value)
     assert (lost.low, lost.high) == pytest.approx((1 - found.high, 1 - found.low))
