@@ -63,8 +63,8 @@ def stm32() -> None:
     print("| bank | chip interrupt, us | COMMIT, ms |\n|---|---|---|")
     for name, bank in full_banks().items():
         chip, board = model()
-        board.prepare(bank)
-        board.fill(0, bank.content)
+        board.prepare_commit(bank)
+        board.write_missing(0, bank.content)
         sizes = (bank.format, bank.packets, len(bank.content), bank.crc)
         began = chip.now
         board.session.call(CommitRequest(0, *sizes, bytes.fromhex(bank.digest)))

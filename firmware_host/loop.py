@@ -25,11 +25,11 @@ from evlcp_sdk.simulated import simulate
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.score import score_frames
 from evlcp_sdk.values import ReceivedMessage
-from firmware_host.board.bank import bank_of, symbol_chips
-from firmware_host.board.board import Board, Programmed, Settings, provision
+from firmware_host.board.bank import make_bank, symbol_chips
+from firmware_host.board.board import Board, ProgramResult, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.board.symbols import symbols_table
-from firmware_host.board.tables import about_table
+from firmware_host.board.tables import info_table
 from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import VerifyError
@@ -40,71 +40,71 @@ RECORDING = "loop.raw"
 """Name of the recording in the folder."""
 
 RECEIVED = "received"
-"""Name of the folder in it that has what was received."""
+"""Name of the result's folder in it."""
 
 _CHIPS = "chips.npy"
-"""What the LEDs did, chip by chip."""
+"""Name of the file with the LEDs' chips."""
 
 _LEAST_PACKETS = 8
-"""Packets in view at least: a quarter of a second of the default link."""
+"""Least number of packets in view: a quarter of a second of the default link."""
 
 _TRANSMITTER_ID = 1
 
 
 @dataclass(frozen=True, eq=False)
 class EmulatedLight:
-    """What the LEDs of an emulated board did from START on.
+    """The light of an emulated board's LEDs from START on.
 
     Attributes:
         record: The LEDs, chip by chip.
-        chips: The same by clusters, uint8 (chips, clusters).
+        chips: The chips of the clusters, uint8 (chips, clusters).
         rate_hz: Chips a second by the board's own crystal.
-        programmed: What programming did.
+        programmed: The result of programming.
         firmware: Version of the board's firmware.
     """
 
     record: LedRecord
     chips: NDArray[np.uint8]
     rate_hz: float
-    programmed: Programmed
+    programmed: ProgramResult
     firmware: str
 
 
 def light_of(symbols: ArrayLike, link: Link, chips: int, trace: Path | None = None) -> EmulatedLight:
-    """Program an emulated board as one on a serial line, and watch its LEDs play.
+    """Program an emulated board like one on a serial line, and record its LEDs.
 
-    The board is the firmware that parts run, compiled for this machine; its time is virtual.
+    The board runs the real firmware, compiled for this machine, in virtual time.
 
     Args:
-        symbols: Symbols, int64 (packets, frames, clusters), played again and again.
-        link: What they are sent with.
-        chips: How many chips to watch at least.
+        symbols: Symbols, int64 (packets, frames, clusters), played repeatedly.
+        link: Their link.
+        chips: Least number of chips to record.
         trace: File to record the line in, as `evlcp board --trace` does.
 
     Raises:
-        BoardError: The board refuses, or its LEDs do something else than the symbols say.
+        BoardError: The board refuses, or its LEDs do not play the symbols.
         ConfigError: A board cannot play this link.
         OutputError: The trace cannot be written.
         ToolchainError: The firmware cannot be built: no C compiler, or no make.
     """
-    bank = bank_of(symbols, link)
+    bank = make_bank(symbols, link)
     device = SimulatedBoard()
     with Session(SimulatedLine(device, "emulated"), Timing(DEFAULT_BAUD), trace=trace) as session:
         board = Board(session)
         programmed = provision(board, bank, Settings())
         device.run(math.ceil(chips / link.air.chip_rate_hz * 1e6) + 1000)
-        about = board.about
+        info = board.info
         record = device.take_led_record().select_chips()
-    told = symbol_chips(symbols, link.codebook, link.packet.pilot_every)
+    expected = symbol_chips(symbols, link.codebook, link.packet.pilot_every)
     played = record.chips(link.bar.led_clusters())
-    differ = played != told[np.arange(len(played)) % len(told)]
+    differ = played != expected[np.arange(len(played)) % len(expected)]
     if len(played) < chips or differ.any():
         raise VerifyError(
             f"emulated: its LEDs did {len(played)} chips, expected at least {chips};"
             f" {np.count_nonzero(differ)} of them are not what the symbols say"
         )
-    rate_hz = (len(record) - 1) * about.tick_hz / float(record.ticks[-1] - record.ticks[0])
-    return EmulatedLight(record, played, rate_hz, programmed, about_table(about)["firmware"])
+    rate_hz = (len(record) - 1) * info.tick_hz / float(record.ticks[-1] - record.ticks[0])
+    return EmulatedLight(record, played, rate_hz, programmed, info_table(info)["firmware"])
 
 
 @dataclass(frozen=True)
@@ -113,18 +113,18 @@ class Step:
 
     Attributes:
         name: message, board, light, scene, receiver or text.
-        said: What was measured, for a person.
-        figures: The same as JSON values.
-        files: What it wrote, within the folder.
+        summary: The measurements as text.
+        figures: The measurements as JSON values.
+        files: Names of the files that it wrote in the folder.
     """
 
     name: str
-    said: str
+    summary: str
     figures: dict[str, Any]
     files: tuple[str, ...] = ()
 
 
-def loop(
+def run_loop(
     text: str,
     link: Link,
     folder: Path,
@@ -132,20 +132,20 @@ def loop(
     distance_m: float = 50.0,
     seed: int = 0,
     sinks: Sequence[str] = (),
-    advance: Callable[[float], None] = lambda _: None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> Iterator[Step]:
-    """Send a text by an emulated board to a simulated camera, and read it: the steps, each as it is done.
+    """Send a text by an emulated board to a simulated camera, and read it; yield each step when it is done.
 
-    Every step leaves its files in the folder, and the next one takes them from there.
+    Every step writes its files to the folder, and the next one reads them.
 
     Args:
-        text: What is sent.
-        link: What both ends share.
-        folder: Made if need be.
+        text: The text.
+        link: The link of both ends.
+        folder: Folder of all files, created if missing.
         distance_m: From the camera to the bar.
-        seed: Of the scene: its noise, and the moment at which the camera begins to look.
-        sinks: Output formats beside the default ones, by name.
-        advance: Called while the scene is rendered with the share that is done.
+        seed: Of the scene: its noise, and the camera's start in a packet.
+        sinks: Output formats besides the default ones, by name.
+        progress: Called while the scene is rendered, with the share done.
 
     Raises:
         BoardError: The board refuses; see `light_of`.
@@ -168,7 +168,7 @@ def loop(
         folder.mkdir(parents=True, exist_ok=True)
     yield _message_step(text, message, symbols, link, folder)
 
-    # Every packet passes whole, a second time if the first has begun before the camera looks.
+    # Every packet is seen whole, the second time if the first began before the camera.
     in_view = max(_LEAST_PACKETS, 2 * len(symbols) + 2)
     light = light_of(symbols, link, (in_view + 2) * link.packet.packet_chips, folder / "wire.jsonl")
     programmed = light.programmed
@@ -180,17 +180,17 @@ def loop(
         ("wire.jsonl",),
     )
     yield _light_step(light, link, folder)
-    scene = _scene_of(light, link, folder / _CHIPS, distance_m, in_view, seed)
-    yield _scene_step(scene, symbols, len(light.chips) // link.packet.packet_chips, folder, seed, advance)
+    scene = _make_scene(light, link, folder / _CHIPS, distance_m, in_view, seed)
+    yield _scene_step(scene, symbols, len(light.chips) // link.packet.packet_chips, folder, seed, progress)
 
     decoded = _DecodedTexts()
     yield _receiver_step(link, folder, decoded, sinks)
     texts = list(dict.fromkeys(decoded.texts))
-    read, as_sent = ", ".join(f'"{one}"' for one in texts), text in texts
+    quoted, as_sent = ", ".join(f'"{one}"' for one in texts), text in texts
     times = "once" if decoded.packets == 1 else f"from {decoded.packets} packets"
-    said = f"{read}, read {times}" + ("" if as_sent else ": not what was sent")
+    summary = f"{quoted}, read {times}" + ("" if as_sent else ": not what was sent")
     figures = {"texts": texts, "packets": decoded.packets, "as_sent": as_sent}
-    yield Step("text", said if texts else "none was read", figures)
+    yield Step("text", summary if texts else "none was read", figures)
 
 
 def _message_step(text: str, message: Message, symbols: NDArray[np.int64], link: Link, folder: Path) -> Step:
@@ -214,19 +214,19 @@ def _message_step(text: str, message: Message, symbols: NDArray[np.int64], link:
         "chips": chips,
         "duration_s": duration_s,
     }
-    said = (
-        f'"{text}", {size} bytes: {_number(count, "packet")} with error correction, {bits} bits as'
+    summary = (
+        f'"{text}", {size} bytes: {_count_text(count, "packet")} with error correction, {bits} bits as'
         f" {symbols.size} symbols in {chips} chips, {1e3 * duration_s:.4g} ms"
     )
-    return Step("message", said, figures, ("link.toml", "message.json"))
+    return Step("message", summary, figures, ("link.toml", "message.json"))
 
 
-def _number(count: int, of: str) -> str:
+def _count_text(count: int, of: str) -> str:
     return f"{count} {of}{'s' * (count != 1)}"
 
 
 def _light_step(light: EmulatedLight, link: Link, folder: Path) -> Step:
-    """Write what the LEDs did."""
+    """Write the LED record and the chips."""
     with Outputs() as outputs:
         outputs.open_binary(folder / "leds.bin").write(light.record.to_bytes())
         outputs.write_array(light.chips, folder / _CHIPS)
@@ -234,14 +234,14 @@ def _light_step(light: EmulatedLight, link: Link, folder: Path) -> Step:
     leds, chips = len(link.bar.led_clusters()), len(light.chips)
     rate_hz, on_share = round(light.rate_hz, 3), round(float(light.chips.mean()), 4)
     figures = {"leds": leds, "chips": chips, "chip_rate_hz": rate_hz, "on_share": on_share}
-    said = (
-        f"{_number(leds, 'LED')}, {rate_hz:g} chips a second, on for {on_share:.0%} of the time;"
+    summary = (
+        f"{_count_text(leds, 'LED')}, {rate_hz:g} chips a second, on for {on_share:.0%} of the time;"
         f" {chips} chips watched, each what the message says"
     )
-    return Step("light", said, figures, ("leds.bin", _CHIPS))
+    return Step("light", summary, figures, ("leds.bin", _CHIPS))
 
 
-def _scene_of(
+def _make_scene(
     light: EmulatedLight, link: Link, chips_file: Path, distance_m: float, in_view: int, seed: int
 ) -> dict[str, Any]:
     """A scene in which a still camera sees the light for so many packets."""
@@ -252,7 +252,7 @@ def _scene_of(
         "start_chip": round(start_chip, 1),
         "ppm": round((light.rate_hz / link.air.chip_rate_hz - 1) * 1e6, 3),
     }
-    # A still camera: by the swing of a car it sees more than a first look needs.
+    # A still camera: the vibration of a car would show more than a first example needs.
     return {
         "name": Path(RECORDING).stem,
         "duration_s": in_view * link.packet.packet_chips / light.rate_hz,
@@ -270,21 +270,21 @@ def _scene_step(
     packets: int,
     folder: Path,
     seed: int,
-    advance: Callable[[float], None],
+    progress: Callable[[float], None],
 ) -> Step:
-    """Render the scene, whose truth says what the packets on air stand for."""
+    """Render the scene, and add the symbols to its truth."""
     raw, duration_s = folder / RECORDING, scene["duration_s"]
     simulated = simulate(scene, seed)
-    _, truth_file = simulated.save(raw, lambda done_s: advance(done_s / duration_s))
+    _, truth_file = simulated.save(raw, lambda done_s: progress(done_s / duration_s))
     _add_symbols(truth_file, symbols, packets)
     distance_m, events = scene["motion"]["distance_m"], simulated.simulation.counts["events"]
     size, duration_s = raw.stat().st_size, round(duration_s, 6)
     figures = {"distance_m": distance_m, "duration_s": duration_s, "events": events, "bytes": size}
-    said = (
+    summary = (
         f"a still camera {distance_m:g} m away looks for {duration_s:.2g} s:"
         f" {events / 1e6:.2f} million events, {size / 1e6:.1f} MB"
     )
-    return Step("scene", said, figures, (raw.name, truth_file.name))
+    return Step("scene", summary, figures, (raw.name, truth_file.name))
 
 
 def _receiver_step(link: Link, folder: Path, decoded: "_DecodedTexts", sinks: Sequence[str]) -> Step:
@@ -293,14 +293,14 @@ def _receiver_step(link: Link, folder: Path, decoded: "_DecodedTexts", sinks: Se
     summary = receive_to_folder(raw, folder / RECEIVED, link, registry=Registry.load(decoded), sinks=sinks)
     counts, transmitters = summary["counts"], summary["transmitters"]
     decoded.packets = counts["blocks_decoded"] + counts["blocks_combined"]
-    # The rows as they are written, which `evlcp score` reads, too.
-    found = score_frames(read_frames(folder / RECEIVED), read_truth(truth_path(raw)))
-    (scored,), (road,) = found["bars"], found["road"]["bars"]
+    # The written rows, as for `evlcp score`.
+    score = score_frames(read_frames(folder / RECEIVED), read_truth(truth_path(raw)))
+    (scored,), (road,) = score["bars"], score["road"]["bars"]
     figures = {
         "result": summary["result"],
         "frames": scored["frames_found"],
         "frames_sent": scored["frames_sent"],
-        "frames_false": found["unmatched"],
+        "frames_false": score["unmatched"],
         "bits": road["bits"],
         "bit_errors": road["bit_errors"],
         "distance_m": transmitters[0]["distance_last_m"] if transmitters else None,
@@ -308,21 +308,21 @@ def _receiver_step(link: Link, folder: Path, decoded: "_DecodedTexts", sinks: Se
         "warnings": summary["warnings"],
     }
     files = tuple(f"{RECEIVED}/{name}" for name in (*summary["files"], "summary.json"))
-    return Step("receiver", _received(figures), figures, files)
+    return Step("receiver", _describe_frames(figures), figures, files)
 
 
-def _received(figures: dict[str, Any]) -> str:
-    """What of the frames was received, for a person."""
+def _describe_frames(figures: dict[str, Any]) -> str:
+    """The received frames as text."""
     frames, sent, errors, bits = (figures[key] for key in ("frames", "frames_sent", "bit_errors", "bits"))
     if not frames:
         return f"{figures['result']}; {sent} frames were sent"
     share = errors / bits if bits else 0.0
-    said = f"{frames} of {sent} frames, {errors} of {bits} bits wrong (BER {share:.2g})"
-    return said + ("" if figures["distance_m"] is None else f"; distance {figures['distance_m']:.2f} m")
+    summary = f"{frames} of {sent} frames, {errors} of {bits} bits wrong (BER {share:.2g})"
+    return summary + ("" if figures["distance_m"] is None else f"; distance {figures['distance_m']:.2f} m")
 
 
 class _DecodedTexts:
-    """Keeps the texts as the receiver announces them, and in how many packets they came."""
+    """Collects the decoded texts, and the number of packets with a block."""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
@@ -335,7 +335,7 @@ class _DecodedTexts:
 
 
 def _add_symbols(truth_file: Path, symbols: NDArray[np.int64], packets: int) -> None:
-    """Say in the truth what the chips of the LEDs stand for, which `light_of` has compared with them."""
+    """Replace the LEDs' chips in the truth by their symbols, which `light_of` has compared."""
     table = read_json(truth_file)
     (bar,) = table["bars"]
     whole = symbols[np.arange(packets) % len(symbols)]

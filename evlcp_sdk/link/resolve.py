@@ -139,7 +139,7 @@ class Link:
             ConfigError: It is no step of the link's framing.
         """
         if role in STEPS and role not in self.algorithms:
-            raise ConfigError(f"{role}{_unused_role(self.table['framing']['id'])}")
+            raise ConfigError(f"{role}{_describe_unused_role(self.table['framing']['id'])}")
         return self.algorithms[role]
 
     def with_algorithm(self, role: str, algorithm: Any, *, id: str | None = None) -> "Link":
@@ -162,7 +162,7 @@ class Link:
         if role != "framing":
             # Raises if it is no step of the link's framing.
             self.algorithm(role)
-        parts = self._built_sections() | {role: algorithm}
+        parts = self._objects_by_section() | {role: algorithm}
         described = is_dataclass(algorithm) and not isinstance(algorithm, type)
         parameters = asdict(algorithm) if described else {}
         keys = {"id": id or type(algorithm).__name__} | json.loads(json.dumps(parameters, default=str))
@@ -182,7 +182,7 @@ class Link:
     def with_air(self, **changes: Any) -> "Link":
         """The same link with other values in `[air]`, e.g. `link.with_air(pilot_every=4)`."""
         air = replace(self.air, **changes)
-        parts, table = self._built_sections() | {"air": air}, {**self.table, "air": asdict(air)}
+        parts, table = self._objects_by_section() | {"air": air}, {**self.table, "air": asdict(air)}
         return _assemble_link(parts, table, self.revisions, self.kinds, self.built_in, self.name)
 
     def block_coder(self) -> BlockCoder:
@@ -194,7 +194,7 @@ class Link:
         code = self.algorithm("error-correction").compile(packet_bits(self.codebook, self.packet))
         return BlockCoder(self.codebook, self.packet, code)
 
-    def _built_sections(self) -> dict[str, Any]:
+    def _objects_by_section(self) -> dict[str, Any]:
         return {section: getattr(self, section) for section in _SPECS} | dict(self.algorithms)
 
 
@@ -315,7 +315,9 @@ class _Resolver:
         for section, keys in self._table.items():
             if section not in _SECTIONS:
                 self._add_fault(
-                    section, self._overridden_key(section), f": unknown table{suggest(section, _SECTIONS)}"
+                    section,
+                    self._find_overridden_key(section),
+                    f": unknown table{suggest(section, _SECTIONS)}",
                 )
             elif not isinstance(keys, Mapping):
                 self._add_fault(section, None, f" = {keys!r}: expected a table")
@@ -328,7 +330,9 @@ class _Resolver:
         if section in STEPS and framing is not None and section not in framing.roles:
             if section in self._table:
                 self._add_fault(
-                    section, self._overridden_key(section), _unused_role(self.resolved["framing"]["id"])
+                    section,
+                    self._find_overridden_key(section),
+                    _describe_unused_role(self.resolved["framing"]["id"]),
                 )
             return
         try:
@@ -342,7 +346,7 @@ class _Resolver:
             if plain is not None:
                 self.resolved[section] = json.loads(json.dumps(plain))
             if section == "modulation":
-                self._unpaired_codes = _known_unpaired_codes(self.built)
+                self._unpaired_codes = _list_unpaired_codes(self.built)
 
     def _build_section(self, section: str, keys: dict[str, Any]) -> dict[str, Any] | None:
         """Build the object that a section describes; return all its keys, None for an unknown algorithm."""
@@ -378,7 +382,7 @@ class _Resolver:
             return str(framing.detection)
         return ROLES[role].default_for(self.built.get("bar"), self._unpaired_codes)
 
-    def _overridden_key(self, section: str) -> str | None:
+    def _find_overridden_key(self, section: str) -> str | None:
         """The first key of a section that came from `--set`; None for none."""
         keys = self._table[section]
         if not isinstance(keys, Mapping):
@@ -478,11 +482,11 @@ def _check_alphabet(codebook: Codebook) -> None:
         raise ValueError("gave 1 codeword, expected two or more")
 
 
-def _unused_role(framing: str) -> str:
+def _describe_unused_role(framing: str) -> str:
     return f": no step of framing '{framing}', which has its own; leave it out"
 
 
-def _known_unpaired_codes(built: Mapping[str, Any]) -> frozenset[str]:
+def _list_unpaired_codes(built: Mapping[str, Any]) -> frozenset[str]:
     """Names of the codes that are not pair codes, as far as they are known and valid."""
     if {"bar", "pilots", "modulation"} <= set(built):
         # Their faults are reported where the codebook is made.

@@ -266,7 +266,7 @@ def model_lengths(spacing_px: float, blurs_px: Floats, backgrounds: Sequence[flo
     Returns:
         float64 (blurs * backgrounds, 3).
     """
-    from evlcp_sdk.scene.optics import airy_blur, blurred_edge
+    from evlcp_sdk.scene.optics import airy_blur, edge_profile
 
     half = _STRIP_WIDTH * spacing_px / 2
     along, across = np.linspace(-spacing_px / 2, spacing_px / 2, 201), np.linspace(0, _ACROSS_PX, 401)
@@ -274,12 +274,12 @@ def model_lengths(spacing_px: float, blurs_px: Floats, backgrounds: Sequence[flo
     for blur_px in blurs_px:
         blur = airy_blur(_UNIT_PX, math.hypot(_REST_PX, blur_px))
         sigma, share = blur.sigma_px[:, None], blur.share[:, None]
-        strip = share * (blurred_edge(across + half, sigma) - blurred_edge(across - half, sigma))
+        strip = share * (edge_profile(across + half, sigma) - edge_profile(across - half, sigma))
         line = strip.sum(0) / strip.sum(0)[0]
         core = (
             strip[:, across <= _AXIS_PX].mean(1, keepdims=True) / strip[:, across <= _AXIS_PX].mean(1).sum()
         )
-        own = (core * (blurred_edge(along, sigma) - blurred_edge(along - spacing_px, sigma))).sum(0)
+        own = (core * (edge_profile(along, sigma) - edge_profile(along - spacing_px, sigma))).sum(0)
         for background in backgrounds:
             threshold = _CONTRAST * background
             lengths.append(

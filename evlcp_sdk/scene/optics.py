@@ -82,13 +82,13 @@ def _airy_gaussians(unit_px: float) -> tuple[Floats, Floats]:
     return all_sigma, all_share
 
 
-def _integrated_cdf(z: Floats, sigma: Floats | float) -> Floats:
+def _cdf_integral(z: Floats, sigma: Floats | float) -> Floats:
     """Integral of a normal distribution function up to z."""
     density = np.exp(-0.5 * (z / sigma) ** 2) / math.sqrt(2 * math.pi)
     total: Floats = z * special.ndtr(z / sigma) + sigma * density
     return total
 
 
-def blurred_edge(z: Floats, sigma: Floats | float) -> Floats:
+def edge_profile(z: Floats, sigma: Floats | float) -> Floats:
     """Lit share of a pixel at `z` from an edge at 0 that a Gaussian blurs."""
-    return _integrated_cdf(z + 0.5, sigma) - _integrated_cdf(z - 0.5, sigma)
+    return _cdf_integral(z + 0.5, sigma) - _cdf_integral(z - 0.5, sigma)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.scene.optics import Blur, airy_blur, blurred_edge
+from evlcp_sdk.scene.optics import Blur, airy_blur, edge_profile
 from evlcp_sdk.sim.leds import LitStrip
 from evlcp_sdk.sim.scene import BarSpec, DropSpec, LensSpec
 
@@ -98,7 +98,7 @@ def tabulate_strip(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> 
     u = np.arange(nodes) / nodes
     # The last node is at infinity, for which any number far above the blur will do.
     z = np.append(scale_px * u / (1 - u), 1e6 * scale_px)
-    steps = blurred_edge(
+    steps = edge_profile(
         np.concatenate([z + strip_px / 2, z - strip_px / 2, -z[:0:-1]]), blur.sigma_px[:, None]
     )
     right, left, before = np.split(steps, [nodes + 1, 2 * nodes + 2], axis=1)

@@ -14,7 +14,7 @@ from scipy.special import ndtr, ndtri
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.scene.optics import Blur, blurred_edge
+from evlcp_sdk.scene.optics import Blur, edge_profile
 from evlcp_sdk.sim import _kernels
 from evlcp_sdk.sim.light import Source, background_switches, cut_changes, sources_of, wiper_switches
 from evlcp_sdk.sim.motion import CameraPath, project
@@ -144,7 +144,7 @@ class _Halo:
     def of(cls, share: float, sigma_px: float, every: int) -> "_Halo":
         reach = 4.5 * sigma_px + 1
         nodes = np.linspace(-reach, reach, _WIDE_NODES)
-        return cls(share, reach, nodes, blurred_edge(nodes, sigma_px), 8 / sigma_px, every)
+        return cls(share, reach, nodes, edge_profile(nodes, sigma_px), 8 / sigma_px, every)
 
     def edge_share(self, at_px: Floats) -> Floats:
         """Return the share of a pixel lit at a distance beyond an edge."""

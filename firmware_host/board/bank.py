@@ -1,4 +1,4 @@
-"""What a driver board is sent: symbols or chips, as the content of a bank."""
+"""Banks of a driver board: packets as symbols or chips, and their bytes."""
 
 import zlib
 from dataclasses import dataclass, replace
@@ -19,13 +19,14 @@ from firmware_host.protocol.rows import BOARD_LEDS, pack_led_rows
 WORD_CHIPS = 16
 PREAMBLE_CHIPS = 32
 MOST_FRAMES = 65_535
-"""What a board composes: chips of a pilot and of an info segment, and at most of a preamble; and frames."""
+"""Packets that a board can compose: chips of a pilot and of an info segment, most chips of a preamble, and
+most frames."""
 
 MOST_RANDOM_FRAMES = 100_000
-"""Random frames at most: minutes of light, far beyond any bank, and within memory."""
+"""Most random frames: minutes of light, far more than any bank holds, but within memory."""
 
 MOST_CHIPS_A_SECOND = 1_000_000
-"""Chips a second that no board takes more of; each says its own maximum, too."""
+"""Highest chip rate of any board; each reports its own limit, too."""
 
 Symbols = NDArray[np.int64]
 Chips = NDArray[np.uint8]
@@ -33,15 +34,15 @@ Chips = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class Bank:
-    """Packets of chips, as a bank of a board holds them.
+    """Packets of chips for a bank of a board.
 
     Attributes:
         format: Info words, the LEDs of each chip, or the clusters of each chip.
-        codebook: What the chips mean.
+        codebook: The codebook of the chips.
         packet: Lengths of a packet's parts.
         led_clusters: The cluster of each LED, int64 (LEDs,).
-        composed: Whether the board knows the codebook, so that it can put packets together.
-        rest: What its LEDs must do while nothing is sent, as the link's framing says.
+        composed: Whether the board composes packets from info words and the codebook.
+        rest: State of the LEDs while nothing is sent, by `Framing.rest`.
         chips: Whole packets, uint8 (chips, clusters or LEDs); none in the queue of a stream.
     """
 
@@ -62,10 +63,10 @@ class Bank:
         chip_rate_hz: float = PacketFormat.chip_rate_hz,
         led_clusters: NDArray[np.int64] = BOARD_LEDS,
     ) -> "Bank":
-        """Symbols (packets, frames, clusters): info words where a board can compose packets, else every chip.
+        """A bank of symbols (packets, frames, clusters): info words if boards compose packets, else chips.
 
         Raises:
-            ConfigError: Symbols of another shape or outside the codebook, or no board can play them.
+            ConfigError: The symbols have another shape or are not in the codebook, or no board can play them.
 
         >>> from evlcp_sdk.link.resolve import resolve
         >>> Bank.of_symbols([[[0] * 16]], resolve({}).codebook).content[:2].hex()
@@ -73,7 +74,7 @@ class Bank:
         """
         chips = symbol_chips(symbols, codebook, pilot_every)
         packet = PacketFormat.of(codebook, np.shape(symbols)[1], chip_rate_hz, pilot_every)
-        return _bank(codebook, packet, led_clusters, chips)
+        return _make_bank(codebook, packet, led_clusters, chips)
 
     @classmethod
     def of_chips(
@@ -83,10 +84,11 @@ class Bank:
         packet: PacketFormat,
         led_clusters: NDArray[np.int64] = BOARD_LEDS,
     ) -> "Bank":
-        """Chips as they are, uint8 (chips, clusters or LEDs), that fill whole packets.
+        """A bank of chips, uint8 (chips, clusters or LEDs), that fill whole packets.
 
         Raises:
-            ConfigError: Another number of chips or columns, they are not 0 and 1, or no board can play them.
+            ConfigError: The number of chips or columns is wrong, a chip is not 0 or 1, or no board can play
+                them.
         """
         c = np.asarray(chips)
         if c.ndim != 2 or not len(c) or len(c) % packet.packet_chips:
@@ -101,17 +103,17 @@ class Bank:
             )
         if c.dtype.kind not in "uib" or not np.isin(c, (0, 1)).all():
             raise ConfigError("chips: expected integers 0 and 1")
-        bank = _bank(codebook, packet, led_clusters, c.astype(np.uint8))
+        bank = _make_bank(codebook, packet, led_clusters, c.astype(np.uint8))
         by_cluster = bank.format == Format.CLUSTERS and c.shape[1] == codebook.clusters
         return replace(bank, format=Format.CLUSTERS if by_cluster else Format.MASKS)
 
     @cached_property
     def content(self) -> bytes:
-        """The bank's bytes; of a link that has no more LEDs than a board."""
+        """The bank's bytes; the link must not have more LEDs than a board."""
         return self.table + (self.encode(self.chips) if len(self.chips) else b"")
 
     def encode(self, chips: Chips) -> bytes:
-        """Whole packets as they stand in a bank."""
+        """The bytes of whole packets in a bank."""
         if self.format == Format.MASKS:
             by_cluster = chips.shape[1] == self.clusters
             return pack_led_rows(chips[:, self.led_clusters] if by_cluster else chips).tobytes()
@@ -123,19 +125,19 @@ class Bank:
         segments = chips.reshape(-1, packet.packet_chips, self.clusters)[:, info].swapaxes(2, 3)
         return np.packbits(segments, axis=3)[..., ::-1].tobytes()
 
-    def chip_by_chip(self) -> "Bank":
-        """The same with every chip in the bank, where the board would compose packets."""
+    def to_chip_format(self) -> "Bank":
+        """The same bank with every chip, if the board would compose packets."""
         form = Format.CLUSTERS if self.format == Format.WORDS else self.format
         return replace(self, format=form, composed=False)
 
     @property
     def packets(self) -> int:
-        """Packets in it."""
+        """Number of packets."""
         return len(self.chips) // self.packet.packet_chips
 
     @property
     def digest(self) -> str:
-        """What its chips mean: digest of the codebook, 64 hex digits."""
+        """Digest of the codebook, 64 hex digits."""
         return self.codebook.digest
 
     @property
@@ -145,12 +147,12 @@ class Bank:
 
     @property
     def clusters(self) -> int:
-        """Clusters."""
+        """Number of clusters."""
         return int(self.led_clusters.max()) + 1
 
     @property
     def table(self) -> bytes:
-        """What stands before the first packet: the masks of the clusters."""
+        """The clusters' masks before the first packet; empty in other formats."""
         if self.format != Format.CLUSTERS:
             return b""
         return pack_led_rows(self.led_clusters == np.arange(self.clusters)[:, None]).tobytes()
@@ -164,12 +166,12 @@ class Bank:
 
     @property
     def chip_bytes(self) -> int:
-        """Bytes of a chip, where every chip is in the bank."""
+        """Bytes of a chip, if the bank has every chip."""
         return -(-self.clusters // 8) if self.format == Format.CLUSTERS else ROW_BYTES
 
     @cached_property
     def duty(self) -> int:
-        """Share of time that it has a LED on, that of the brightest, permille, rounded up."""
+        """Share of time that the brightest LED is on, permille, rounded up."""
         return -(-1000 * int(self.chips.sum(0, dtype=np.int64).max()) // len(self.chips))
 
     @cached_property
@@ -178,14 +180,14 @@ class Bank:
         return zlib.crc32(self.content)
 
 
-def _bank(
+def _make_bank(
     codebook: Codebook,
     packet: PacketFormat,
     led_clusters: NDArray[np.int64],
     chips: Chips | None = None,
     rest: int | None = None,
 ) -> Bank:
-    """A bank in the most compact format that takes a link, without chips for a queue.
+    """A bank in the most compact format for a link; without chips it is a queue.
 
     Raises:
         ConfigError: No board can play it.
@@ -201,7 +203,7 @@ def _bank(
 
 
 def is_composed(packet: PacketFormat, led_clusters: NDArray[np.int64]) -> bool:
-    """Whether a board can compose the packets of a link; otherwise it is sent every chip."""
+    """Whether a board can compose the packets of a link, instead of getting every chip."""
     return (
         np.array_equal(led_clusters, BOARD_LEDS)
         and packet.pilot_chips == packet.info_chips == WORD_CHIPS
@@ -211,7 +213,7 @@ def is_composed(packet: PacketFormat, led_clusters: NDArray[np.int64]) -> bool:
 
 
 def check_rate(packet: PacketFormat) -> None:
-    """Raise ConfigError, one line, if no driver board plays so many chips a second; the rest HELLO says."""
+    """Raise ConfigError if no driver board can play the chip rate."""
     rate = packet.chip_rate_hz
     if rate != round(rate) or rate > MOST_CHIPS_A_SECOND:
         raise ConfigError(
@@ -220,8 +222,8 @@ def check_rate(packet: PacketFormat) -> None:
         )
 
 
-def bank_of(symbols: ArrayLike, link: Link) -> Bank:
-    """Symbols (packets, frames, clusters) of a link.
+def make_bank(symbols: ArrayLike, link: Link) -> Bank:
+    """A bank of symbols (packets, frames, clusters) of a link.
 
     Raises:
         ConfigError: The symbols are not the link's, or no board can play it.
@@ -232,20 +234,20 @@ def bank_of(symbols: ArrayLike, link: Link) -> Bank:
     return replace(bank, rest=link.algorithm("framing").rest())
 
 
-def queue_of(link: Link) -> Bank:
-    """The bank of a stream of a link's packets: without packets.
+def make_queue(link: Link) -> Bank:
+    """A bank without packets, for a stream of a link's packets.
 
     Raises:
         ConfigError: No board can play it.
     """
     rest = link.algorithm("framing").rest()
-    bank = _bank(link.codebook, link.packet, link.bar.led_clusters(), rest=rest)
-    # A board that composes packets has words for no pause.
-    return bank if rest is None else bank.chip_by_chip()
+    bank = _make_bank(link.codebook, link.packet, link.bar.led_clusters(), rest=rest)
+    # A pause cannot be composed.
+    return bank if rest is None else bank.to_chip_format()
 
 
 def random_symbols(packets: int, frames: int, codebook: Codebook, generator: np.random.Generator) -> Symbols:
-    """Uniform symbols, of those that carry bits, int64 (packets, frames, clusters)."""
+    """Random symbols that carry bits, uniform, int64 (packets, frames, clusters)."""
     shape = (packets, frames, codebook.clusters)
     return generator.integers(0, codebook.data_symbols, shape, dtype=np.int64)
 
@@ -254,7 +256,7 @@ def random_packets(packets: int, link: Link, seed: int) -> Symbols:
     """Random symbols of a link, int64 (packets, frames, clusters).
 
     Raises:
-        ConfigError: None, or too many.
+        ConfigError: There are none, or too many.
     """
     frames = link.packet.frames
     if not 0 < packets * frames <= MOST_RANDOM_FRAMES:
@@ -266,10 +268,10 @@ def random_packets(packets: int, link: Link, seed: int) -> Symbols:
 
 
 def symbol_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -> NDArray[np.uint8]:
-    """Chips of packets one after another: symbols (P, F, K) to uint8 (chips, K), 1 = on.
+    """Chips of consecutive packets: symbols (P, F, K) to uint8 (chips, K), 1 = on.
 
     Raises:
-        ConfigError: Symbols of another shape or outside the codebook.
+        ConfigError: The symbols have another shape, or are not in the codebook.
     """
     s = np.asarray(symbols)
     if s.ndim != 3 or not s.size:
@@ -278,7 +280,7 @@ def symbol_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -
 
 
 def read_masks(path: Path, link: Link) -> Bank:
-    """Chips of a link from a `.npy` file: uint8 (chips, LEDs) or (chips, clusters), whole packets.
+    """A bank from a `.npy` file of a link's chips: uint8 (chips, LEDs) or (chips, clusters), whole packets.
 
     Raises:
         ConfigError: No board can play such packets.

@@ -1,4 +1,4 @@
-"""What a host does with a board: program it, start and stop it, ask how it is."""
+"""A driver board: program it, start and stop it, read its state."""
 
 import zlib
 from collections import deque
@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from evlcp_sdk.air.codebook import word_of_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
-from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, queue_of
+from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, make_queue
 from firmware_host.board.session import Session
-from firmware_host.board.stream import AHEAD, Stream
-from firmware_host.board.tables import name_of
+from firmware_host.board.stream import DEFAULT_AHEAD, Stream
+from firmware_host.board.tables import enum_name
 from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.generated import requests as protocol
@@ -28,31 +28,31 @@ from firmware_host.protocol.generated.requests import (
     Watchdog,
 )
 
-_BLOCK = 2048
-"""Bytes of a bank whose CRC decides together whether they are there."""
+_BLOCK_BYTES = 2048
+"""Bytes of a bank that are compared by one CRC."""
 
 _MOST_HOLD = 255
-"""Chips of its chip rate that a board shows a chip for, at most."""
+"""Most times that a board repeats a chip."""
 
-_LEAST = 32
-"""Smallest piece that a noisy line is tried with, bytes."""
+_SMALLEST_PIECE_BYTES = 32
+"""Smallest piece that is tried on a noisy line."""
 
 Progress = Callable[[int, int], None]
 """Called with bytes done and bytes in all."""
 
 
 @dataclass(frozen=True)
-class Programmed:
-    """What programming did.
+class ProgramResult:
+    """The result of programming.
 
     Attributes:
-        written: Bytes sent into the bank; 0 if all was there.
+        written: Bytes sent into the bank; 0 if it had them all.
         length: Bytes of the payload.
         swapped: Whether another bank became active.
         bank: The active bank.
-        retries: Requests that had to be sent again.
+        retries: Number of requests that were sent again.
         watchdog: What the board does when this host falls silent: keep, idle or dark.
-        watchdog_ms: After which silence, ms.
+        watchdog_ms: Silence after which it does so, ms.
     """
 
     written: int
@@ -66,13 +66,13 @@ class Programmed:
 
 @dataclass(frozen=True)
 class Settings:
-    """What a board is set to besides its bank.
+    """A board's settings besides its bank.
 
     Attributes:
         level_ma: LED current, mA; None leaves it.
         watchdog: What to do when the host falls silent; None leaves it.
-        watchdog_ms: After which silence, ms.
-        start: Whether to play when all is done.
+        watchdog_ms: Silence after which it is done, ms.
+        start: Whether to play at the end.
         level_limit_ma: Largest LED current from now on, mA; None leaves it.
         duty_limit: Largest share of time that a LED is on from now on, 0.001 to 1; None leaves it.
 
@@ -95,11 +95,11 @@ class Settings:
 
 
 class Board:
-    """The board at the other end of a line; says HELLO at once.
+    """The board at the other end of a line, which is greeted with HELLO at once.
 
     Attributes:
         session: The session.
-        about: What HELLO said.
+        info: The board's answer to HELLO.
 
     Raises:
         NoBoardError: Nobody answers.
@@ -108,33 +108,33 @@ class Board:
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        self.about: protocol.HelloReply = session.hello()
+        self.info: protocol.HelloReply = session.hello()
 
     # -- single requests
 
     def status(self) -> protocol.StatusReply:
-        """What the board does."""
+        """The board's state."""
         return self.session.call(protocol.StatusRequest())
 
     def start(self, at_pulse: int = 0, pulse_hz: int = 1, at_clock: int = 0) -> None:
-        """Play the active bank: now, at a pulse and in step with them from then on, or at a clock.
+        """Play the active bank: now, at a pulse and from then on in step with the pulses, or at a clock.
 
         Args:
             at_pulse: The pulse, as STATUS counts them; 0: none.
             pulse_hz: Pulses a second.
-            at_clock: The clock, as STATUS tells it; 0: none.
+            at_clock: The clock, as in STATUS; 0: none.
         """
         self.session.call(protocol.StartRequest(at_pulse, pulse_hz if at_pulse else 0, at_clock))
 
     def stop(self) -> None:
-        """Finish the packet, then dark; a stream ends, and what waits in it is dropped."""
+        """Go dark after the packet; a stream ends, and its waiting packets are dropped."""
         self.session.call(protocol.StopRequest())
 
     def blank(self) -> None:
-        """Dark at once."""
+        """Go dark at once."""
         self.session.call(protocol.BlankRequest())
 
-    def level(self, level_ma: int) -> None:
+    def set_level(self, level_ma: int) -> None:
         """Set the LED current, mA.
 
         Raises:
@@ -142,8 +142,8 @@ class Board:
         """
         self.session.call(protocol.LevelRequest(level_ma))
 
-    def watchdog(self, action: Watchdog, timeout_ms: int) -> None:
-        """What to do when the host is silent for `timeout_ms`."""
+    def set_watchdog(self, action: Watchdog, timeout_ms: int) -> None:
+        """Set what the board does when the host is silent for `timeout_ms`."""
         self.session.call(protocol.WatchdogRequest(action, timeout_ms))
 
     def save(self, autostart: bool = False) -> protocol.SaveReply:
@@ -151,33 +151,33 @@ class Board:
         return self.session.call(protocol.SaveRequest(int(autostart)))
 
     def recall(self) -> protocol.RecallReply:
-        """Commit what was saved."""
+        """Commit the saved bank and settings."""
         return self.session.call(protocol.RecallRequest())
 
     def test_leds(self, first: int, last: int, dwell_ms: int) -> None:
-        """Walk over LEDs one by one."""
+        """Light LEDs one by one."""
         self.session.call(protocol.LedTestRequest(first, last, dwell_ms))
 
     def set_key(self, key: bytes | None) -> None:
-        """Set the board's key, or take it away; a new session begins, and SAVE keeps it.
+        """Set the board's key, or remove it; a new session begins, and SAVE keeps the key.
 
         Raises:
             IncompatibleError: The board has no random numbers, which keys need, or no keys.
-            RefusedError: It has a key, and this host not.
+            RefusedError: It has a key, and this host does not.
         """
-        if not self.about.capabilities & Capability.TRUST:
+        if not self.info.capabilities & Capability.TRUST:
             raise IncompatibleError(f"{self.session.name}: cannot have a key; see 'evlcp board hello'")
         self.session.call(protocol.KeyRequest(key or bytes(protocol.KEY_BYTES)))
         self.session.key = key
-        self.about = self.session.renew()
+        self.info = self.session.renew()
 
-    def crc(self, bank: int, offset: int, length: int) -> int:
+    def read_crc(self, bank: int, offset: int, length: int) -> int:
         """CRC-32 of a bank's bytes."""
         return self.session.call(protocol.CrcRequest(bank, offset, length)).crc
 
-    def read(self, bank: int, offset: int, length: int) -> bytes:
+    def read_bank(self, bank: int, offset: int, length: int) -> bytes:
         """A bank's bytes."""
-        most = self.about.max_payload - protocol.ReadReply.min_bytes()
+        most = self.info.max_payload - protocol.ReadReply.min_bytes()
         end, found = offset + length, list[tuple[int, bytes]]()
         reads = (protocol.ReadRequest(bank, at, min(most, end - at)) for at in range(offset, end, most))
         self.session.call_each(reads, lambda _, reply: found.append((reply.offset, reply.data)))
@@ -188,25 +188,25 @@ class Board:
 
     # -- programming
 
-    def limit(self, bank: Bank, level_ma: int | None = None, duty: float | None = None) -> None:
-        """Set limits of light, which hold at once; and chip rate and profile for the next commit.
+    def set_limits(self, bank: Bank, level_ma: int | None = None, duty: float | None = None) -> None:
+        """Set the light limits, valid at once, and chip rate and profile for the next commit.
 
         Args:
-            bank: What comes next.
+            bank: The next bank.
             level_ma: Largest LED current, mA; None leaves it.
             duty: Largest share of time that a LED is on, 0.001 to 1; None leaves it.
 
         Raises:
-            RefusedError: The board cannot take a value, or what it plays is brighter; nothing is changed.
+            RefusedError: The board cannot take a value, or plays something brighter; nothing is changed.
         """
         if duty is not None:
             status = self.status()
             if status.active_bank != NO_BANK:
                 self.check_duty("what is programmed", status.duty, duty)
-        self._configure(self.fitted(bank), level_ma or 0, 0 if duty is None else round(1000 * duty))
+        self._configure(self.adapt_bank(bank), level_ma or 0, 0 if duty is None else round(1000 * duty))
 
     def check_duty(self, what: str, permille: int, limit: float) -> None:
-        """Raise RefusedError if something has a LED on for a larger share of time than a limit."""
+        """Raise RefusedError if `what` has a LED on for a larger share of time than a limit."""
         if permille > round(1000 * limit):
             raise RefusedError(
                 f"{self.session.name}: {what} has a LED on for {permille / 1000:g} of the time, the duty"
@@ -216,8 +216,8 @@ class Board:
                 round(1000 * limit),
             )
 
-    def prepare(self, bank: Bank) -> None:
-        """Set chip rate, profile and codebook, or how many chips a packet has, for the next commit.
+    def prepare_commit(self, bank: Bank) -> None:
+        """Set chip rate, profile and codebook, or the chips of a packet, for the next commit.
 
         Raises:
             IncompatibleError: The firmware was built with another codebook, or plays no chips without one.
@@ -227,62 +227,60 @@ class Board:
         digest = bytes.fromhex(bank.digest)
         if not bank.composed:
             clusters = bank.clusters if bank.format == Format.CLUSTERS else 0
-            request = protocol.ChipsRequest(bank.packet.packet_chips, self._hold(bank), clusters, digest)
+            request = protocol.ChipsRequest(
+                bank.packet.packet_chips, self._hold_count(bank), clusters, digest
+            )
             self.session.call(request)
             return
         pilots = tuple(map(word_of_chips, bank.codebook.pilots))
         preamble = (bank.packet.preamble_chips, word_of_chips(bank.codebook.preamble))
         self.session.call(protocol.CodebookRequest(*preamble, pilots, digest))
 
-    def _hold(self, bank: Bank) -> int:
-        """How many chips of the board's chip rate a chip of the bank lasts.
-
-        More than one where the board has no chips as long as these.
-        """
-        about, rate = self.about, bank.chip_rate_hz
+    def _hold_count(self, bank: Bank) -> int:
+        """Times that the board repeats a chip of the bank; above 1 if it has no chips as long as these."""
+        info, rate = self.info, bank.chip_rate_hz
         if not bank.composed:
-            for hold in range(1, min(_MOST_HOLD, about.chip_rate_max_hz // rate) + 1):
-                if rate * hold >= about.chip_rate_min_hz and about.tick_hz % (rate * hold) == 0:
+            for hold in range(1, min(_MOST_HOLD, info.chip_rate_max_hz // rate) + 1):
+                if rate * hold >= info.chip_rate_min_hz and info.tick_hz % (rate * hold) == 0:
                     return hold
         return 1
 
-    def fitted(self, bank: Bank) -> Bank:
-        """A bank as this board can play it.
+    def adapt_bank(self, bank: Bank) -> Bank:
+        """The bank in a format that this board can play.
 
-        Chip by chip where it would compose packets, but has no chips as long as theirs and so shows each
-        several times.
+        A board that repeats each chip of a slow link does not compose packets, and gets every chip.
         """
-        slow = bank.composed and bank.chip_rate_hz < self.about.chip_rate_min_hz
-        return bank.chip_by_chip() if slow else bank
+        slow = bank.composed and bank.chip_rate_hz < self.info.chip_rate_min_hz
+        return bank.to_chip_format() if slow else bank
 
     def _configure(self, bank: Bank, level_limit_ma: int = 0, duty_limit: int = 0) -> None:
-        about, rate = self.about, bank.chip_rate_hz * self._hold(bank)
+        info, rate = self.info, bank.chip_rate_hz * self._hold_count(bank)
         packet = (bank.packet.frames, bank.packet.pilot_every) if bank.composed else (1, 1)
         limits = (level_limit_ma, duty_limit)
         try:
             self.session.call(protocol.ConfigureRequest(rate, profile_number(bank), *packet, *limits))
         except RefusedError as fault:
-            # the chip rate is what the board looks at first
-            wrong = not about.chip_rate_min_hz <= rate <= about.chip_rate_max_hz or about.tick_hz % rate
+            # the board checks the chip rate first
+            wrong = not info.chip_rate_min_hz <= rate <= info.chip_rate_max_hz or info.tick_hz % rate
             if fault.status != Status.OUT_OF_RANGE or not wrong:
                 raise
-            least = f"at least {about.chip_rate_min_hz}, " if about.chip_rate_min_hz else ""
+            least = f"at least {info.chip_rate_min_hz}, " if info.chip_rate_min_hz else ""
             raise RefusedError(
                 f"{self.session.name}: no chip rate of {rate} Hz: must divide"
-                f" {about.tick_hz} Hz, {least}at most {about.chip_rate_max_hz};"
+                f" {info.tick_hz} Hz, {least}at most {info.chip_rate_max_hz};"
                 f" the nearest the board can take is {fault.detail}",
                 fault.status,
                 fault.detail,
             ) from fault
 
-    def holds(self, bank: Bank, status: protocol.StatusReply) -> bool:
-        """Whether the active bank is this one."""
+    def is_active_bank(self, bank: Bank, status: protocol.StatusReply) -> bool:
+        """Whether the board's active bank is this one."""
         same = status.active_bank != NO_BANK and status.crc == bank.crc
-        return same and self._difference(bank, status) is None
+        return same and self._find_difference(bank, status) is None
 
-    def _difference(self, bank: Bank, status: protocol.StatusReply) -> str | None:
-        """What STATUS says otherwise of the active bank than it would of this one; its CRC left alone."""
-        packet, hold = bank.packet, self._hold(bank)
+    def _find_difference(self, bank: Bank, status: protocol.StatusReply) -> str | None:
+        """The first difference between the active bank in STATUS and this one, but for the CRC."""
+        packet, hold = bank.packet, self._hold_count(bank)
         expected: dict[str, object] = {
             "format": bank.format,
             "packets": bank.packets,
@@ -301,29 +299,29 @@ class Board:
                 return f"{name} = {getattr(status, name)}, expected {value}"
         return None
 
-    def program(self, content: Bank, verify: bool = True, progress: Progress | None = None) -> Programmed:
-        """Bring a bank's content onto the board and make it active; what is there already is not sent again.
+    def program(self, content: Bank, verify: bool = True, progress: Progress | None = None) -> ProgramResult:
+        """Write a bank's content to the board and activate it; blocks that the board has are not sent.
 
-        A board that plays goes on with the old bank until the new one is complete and checked, and changes
+        A board that plays goes on with the old bank until the new one is complete and checked, and swaps
         between two packets.
 
         Raises:
-            ConfigError: The content is larger than a bank, or of other clusters than the board.
+            ConfigError: The content is larger than a bank, or its clusters are not the board's.
             RefusedError: The board refuses a value, or plays at another chip rate; then nothing is sent.
             VerifyError: The bank does not hold what was sent.
-            LineError: The line fails; what was active stays so.
+            LineError: The line fails; the active bank stays.
         """
-        content = self.fitted(content)
+        content = self.adapt_bank(content)
         self.check_fits(content)
         retries, total, written = self.session.client.retries, len(content.content), 0
-        status = self._settled()
-        swapped = not self.holds(content, status)
+        status = self._wait_until_swapped()
+        swapped = not self.is_active_bank(content, status)
         if swapped:
             self._check_rate(content, status)
-            self.prepare(content)
+            self.prepare_commit(content)
             bank = 1 if status.active_bank == 0 else 0
-            written = self.fill(bank, content.content, progress)
-            if verify and written and self.crc(bank, 0, total) != content.crc:
+            written = self.write_missing(bank, content.content, progress)
+            if verify and written and self.read_crc(bank, 0, total) != content.crc:
                 raise VerifyError(
                     f"{self.session.name}: bank {bank} does not hold what was sent; the old one goes on;"
                     " program it again, and if that does not help have the board looked at"
@@ -331,34 +329,34 @@ class Board:
             digest = bytes.fromhex(content.digest)
             commit = protocol.CommitRequest(bank, content.format, content.packets, total, content.crc, digest)
             self.session.call(commit)
-            status = self._settled()
-            if verify and not self.holds(content, status):
+            status = self._wait_until_swapped()
+            if verify and not self.is_active_bank(content, status):
                 raise VerifyError(
                     f"{self.session.name}: bank {status.active_bank} is active, expected {bank};"
                     " program it again"
                 )
         elif progress:
             progress(total, total)
-        return Programmed(
+        return ProgramResult(
             written=written,
             length=total,
             swapped=swapped,
             bank=status.active_bank,
             retries=self.session.client.retries - retries,
-            watchdog=name_of(Watchdog, status.watchdog),
+            watchdog=enum_name(Watchdog, status.watchdog),
             watchdog_ms=status.watchdog_ms,
         )
 
-    def stream(self, link: Link, ahead: int = AHEAD) -> Stream:
-        """Make the spare bank a queue of packets, and play from it: packets as they come.
+    def stream(self, link: Link, ahead: int = DEFAULT_AHEAD) -> Stream:
+        """Make the spare bank a queue of packets, and play from it.
 
-        The board changes to it between two packets, and shows its idle pattern while the queue is empty. If
-        the link's framing says what LEDs do while nothing is sent, packets of that keep it from being empty.
+        The board swaps to it between two packets, and shows its idle pattern while the queue is empty. If the
+        link's framing determines the LEDs' state while nothing is sent, the queue is kept filled with it.
 
         Args:
-            link: What the packets are sent with.
-            ahead: Packets that wait on the board, the one that plays among them: the delay of a packet behind
-                others, and how long the host may be held up.
+            link: The packets' link.
+            ahead: Packets on the board, the playing one included: they determine a packet's delay, and how
+                long the host may stall.
 
         Raises:
             ConfigError: The board cannot play the link, or `ahead` is less than 2.
@@ -367,19 +365,19 @@ class Board:
         """
         if ahead < 2:
             raise ConfigError(f"ahead = {ahead}, expected 2 or more packets: one plays, the next waits")
-        like = self.fitted(queue_of(link))
-        if not self.about.capabilities & Capability.STREAM:
+        like = self.adapt_bank(make_queue(link))
+        if not self.info.capabilities & Capability.STREAM:
             raise IncompatibleError(f"{self.session.name}: its firmware has no streams; update the firmware")
         self.check_fits(like)
-        status = self._settled()
+        status = self._wait_until_swapped()
         self._check_rate(like, status)
         if like.rest:
-            share = min(status.duty_limit / 1000, self.about.mean_max_ma / max(1, status.level_ma))
+            share = min(status.duty_limit / 1000, self.info.mean_max_ma / max(1, status.level_ma))
             self.check_duty("a pause of this link", 1000, min(1.0, share))
-        self.prepare(like)
+        self.prepare_commit(like)
         bank = 1 if status.active_bank == 0 else 0
         if like.content:
-            self.fill(bank, like.content)
+            self.write_missing(bank, like.content)
         request = protocol.StreamRequest(bank, like.format, bytes.fromhex(like.digest))
         slots = self.session.call(request).slots
         if ahead >= slots:
@@ -393,8 +391,8 @@ class Board:
         return stream
 
     def _check_rate(self, content: Bank, status: protocol.StatusReply) -> None:
-        """Raise RefusedError if chips run at another rate, which a board that plays keeps."""
-        rate_hz = content.chip_rate_hz * self._hold(content)
+        """Raise RefusedError if the board plays at another chip rate."""
+        rate_hz = content.chip_rate_hz * self._hold_count(content)
         runs = status.state in (State.PLAYING, State.STOPPING, State.IDLE_PATTERN)
         if runs and status.chip_rate_hz != rate_hz:
             raise RefusedError(
@@ -406,7 +404,7 @@ class Board:
             )
 
     def check_same_air(self, bank: Bank, status: protocol.StatusReply) -> None:
-        """Raise IncompatibleError unless what plays and what comes are of one codebook and one chip rate."""
+        """Raise IncompatibleError unless the bank has the codebook and chip rate of the active one."""
         book, rate_hz = status.digest.hex(), status.chip_rate_hz // max(1, status.hold)
         if (book, rate_hz) != (bank.digest, bank.chip_rate_hz):
             raise IncompatibleError(
@@ -416,13 +414,13 @@ class Board:
             )
 
     def verify(self, bank: Bank) -> int:
-        """Read the active bank back and compare it; its number.
+        """Read the active bank back and compare it; return its number.
 
         Raises:
-            IncompatibleError: It is of another codebook or chip rate.
+            IncompatibleError: It has another codebook or chip rate.
             VerifyError: It holds something else.
         """
-        bank, s, name = self.fitted(bank), self.status(), self.session.name
+        bank, s, name = self.adapt_bank(bank), self.status(), self.session.name
         again = "'evlcp board program' brings it there"
         if s.active_bank == NO_BANK:
             raise VerifyError(f"{name}: nothing is programmed; {again}")
@@ -431,43 +429,43 @@ class Board:
                 f"{name}: its bank is the queue of a stream, which holds nothing to compare; {again}"
             )
         self.check_same_air(bank, s)
-        difference = self._difference(bank, s)
+        difference = self._find_difference(bank, s)
         if difference is not None:
             raise VerifyError(f"{name}: holds other packets: {difference}; {again}")
-        held = self.read(s.active_bank, 0, s.length)
-        differ = next((i for i, (a, b) in enumerate(zip(held, bank.content, strict=True)) if a != b), None)
-        if differ is not None:
+        held = self.read_bank(s.active_bank, 0, s.length)
+        wrong = next((i for i, (a, b) in enumerate(zip(held, bank.content, strict=True)) if a != b), None)
+        if wrong is not None:
             raise VerifyError(
-                f"{name}: byte {differ} of bank {s.active_bank} is {held[differ]:#04x},"
-                f" expected {bank.content[differ]:#04x}; {again}"
+                f"{name}: byte {wrong} of bank {s.active_bank} is {held[wrong]:#04x},"
+                f" expected {bank.content[wrong]:#04x}; {again}"
             )
         return s.active_bank
 
     def check_fits(self, bank: Bank) -> None:
-        """Raise ConfigError unless the content fits the board's LEDs, formats and bank, as HELLO tells them.
+        """Raise ConfigError unless the content fits the board's LEDs, formats and bank by its HELLO.
 
         Raises:
             IncompatibleError: Its firmware does not play such links.
         """
-        about, name, leds = self.about, self.session.name, len(bank.led_clusters)
-        if leds > about.leds:
-            raise ConfigError(f"a link of {leds} LEDs, {name} has {about.leds}: HELLO says so")
-        if bank.composed and (about.leds, about.clusters) != (LEDS, CLUSTERS):
+        info, name, leds = self.info, self.session.name, len(bank.led_clusters)
+        if leds > info.leds:
+            raise ConfigError(f"a link of {leds} LEDs, {name} has {info.leds}: HELLO says so")
+        if bank.composed and (info.leds, info.clusters) != (LEDS, CLUSTERS):
             raise ConfigError(
-                f"packets of {CLUSTERS} clusters and {LEDS} LEDs, {name} has {about.clusters}"
-                f" and {about.leds}: HELLO says so"
+                f"packets of {CLUSTERS} clusters and {LEDS} LEDs, {name} has {info.clusters}"
+                f" and {info.leds}: HELLO says so"
             )
-        if not bank.composed and not about.formats >> bank.format & 1:
+        if not bank.composed and not info.formats >> bank.format & 1:
             raise IncompatibleError(
-                f"{name}: its firmware (protocol {about.major}.{about.minor}) plays packets that it composes"
+                f"{name}: its firmware (protocol {info.major}.{info.minor}) plays packets that it composes"
                 f" alone: of {LEDS} LEDs in {CLUSTERS} equal clusters, codes of {WORD_CHIPS} chips, a"
                 f" preamble of at most {PREAMBLE_CHIPS}; update the firmware"
             )
-        room = about.bank_bytes - len(bank.table)
-        what = f"a bank of {name} has {about.bank_bytes}" + (
+        room = info.bank_bytes - len(bank.table)
+        what = f"a bank of {name} has {info.bank_bytes}" + (
             f", {len(bank.table)} of them for the clusters" if len(bank.table) else ""
         )
-        # a stream needs room for one that plays and one that comes
+        # a stream needs room for the playing packet and the next one
         queue = not bank.packets
         if bank.packet_bytes * (2 if queue else 1) > room:
             words = bank.format == Format.WORDS
@@ -483,48 +481,48 @@ class Board:
                 f" send at most {room // bank.packet_bytes} packets"
             )
 
-    def fill(self, bank: int, content: bytes, progress: Progress | None = None) -> int:
-        """Write what a spare bank does not hold yet; returns the bytes written.
+    def write_missing(self, bank: int, content: bytes, progress: Progress | None = None) -> int:
+        """Write the blocks that a spare bank lacks; return the bytes written.
 
-        On a noisy line a piece that does not get through is cut in two.
+        On a noisy line a piece that gets no answer is halved.
 
         Raises:
-            LineError: Not even the smallest piece gets through.
+            LineError: Even the smallest piece gets no answer.
         """
-        missing = self._missing(bank, content)
+        missing = self._find_missing(bank, content)
         total = sum(n for _, n in missing)
         done = len(content) - total
         if progress is not None:
             progress(done, len(content))
-        piece = self.session.max_payload - protocol.WriteRequest.min_bytes()
-        left = deque((at, at + n) for at, n in missing)
+        piece_bytes = self.session.max_payload - protocol.WriteRequest.min_bytes()
+        queue = deque((at, at + n) for at, n in missing)
 
         def requests() -> Iterator[protocol.WriteRequest]:
-            while left:
-                at, end = left.popleft()
-                if end - at > piece:
-                    left.appendleft((at + piece, end))
-                    end = at + piece
+            while queue:
+                at, end = queue.popleft()
+                if end - at > piece_bytes:
+                    queue.appendleft((at + piece_bytes, end))
+                    end = at + piece_bytes
                 yield protocol.WriteRequest(bank, at, content[at:end])
 
         def handle(request: protocol.WriteRequest, outcome: RequestOutcome) -> None:
-            nonlocal piece, done
+            nonlocal piece_bytes, done
             n = len(request.data)
-            if outcome.status is None and n > _LEAST:
-                piece = max(_LEAST, min(piece, n // 2))
-                left.append((request.offset, request.offset + n))
+            if outcome.status is None and n > _SMALLEST_PIECE_BYTES:
+                piece_bytes = max(_SMALLEST_PIECE_BYTES, min(piece_bytes, n // 2))
+                queue.append((request.offset, request.offset + n))
                 return
-            self.session.checked(request, outcome)
+            self.session.expect_reply(request, outcome)
             done += n
             if progress is not None:
                 progress(done, len(content))
 
-        while left:
+        while queue:
             self.session.run(requests(), handle)
         return total
 
-    def _missing(self, bank: int, content: bytes) -> list[tuple[int, int]]:
-        """Blocks (offset, bytes) of a bank that are not `content`."""
+    def _find_missing(self, bank: int, content: bytes) -> list[tuple[int, int]]:
+        """Blocks (offset, bytes) of a bank that differ from `content`."""
         missing: list[tuple[int, int]] = []
 
         def handle(request: protocol.CrcRequest, reply: protocol.CrcReply) -> None:
@@ -532,14 +530,14 @@ class Board:
             if zlib.crc32(content[at : at + n]) != reply.crc:
                 missing.append((at, n))
 
-        blocks = range(0, len(content), _BLOCK)
-        crcs = (protocol.CrcRequest(bank, at, min(_BLOCK, len(content) - at)) for at in blocks)
+        blocks = range(0, len(content), _BLOCK_BYTES)
+        crcs = (protocol.CrcRequest(bank, at, min(_BLOCK_BYTES, len(content) - at)) for at in blocks)
         self.session.call_each(crcs, handle)
         return sorted(missing)
 
-    def _settled(self) -> protocol.StatusReply:
-        """Status once no bank waits for its packet boundary."""
-        status = self.session.status_when(lambda status: status.pending_bank == NO_BANK, 10.0, 0.002)
+    def _wait_until_swapped(self) -> protocol.StatusReply:
+        """Status when no bank is pending any more."""
+        status = self.session.wait_for_status(lambda status: status.pending_bank == NO_BANK, 10.0, 0.002)
         if status.pending_bank != NO_BANK:
             raise VerifyError(
                 f"{self.session.name}: bank {status.pending_bank} does not become active;"
@@ -547,12 +545,12 @@ class Board:
             )
         return status
 
-    def stay(self, seconds: float, status: protocol.StatusReply) -> None:
-        """Wait, and let the board hear of this host so often that its watchdog does not act.
+    def wait_with_keep_alive(self, seconds: float, status: protocol.StatusReply) -> None:
+        """Wait, with requests often enough that the board's watchdog does not act.
 
         Args:
-            seconds: How long, s.
-            status: What the board said last: its watchdog counts.
+            seconds: Duration, s.
+            status: The board's last status, with its watchdog.
         """
         line = self.session.transport
         end = line.time_s() + seconds
@@ -564,20 +562,20 @@ class Board:
                 self.status()
 
     def wait_dark(self, timeout_s: float = 10.0) -> protocol.StatusReply:
-        """Status once the LEDs are dark after a stop; faults as of `Session.wait_dark`."""
+        """Status when the LEDs are dark after a stop; errors as of `Session.wait_dark`."""
         return self.session.wait_dark(timeout_s)
 
 
 def provision(
     board: Board, bank: Bank, settings: Settings, verify: bool = True, progress: Progress | None = None
-) -> Programmed:
-    """Bring a board to a bank and settings; what is so already is left alone.
+) -> ProgramResult:
+    """Set a board's bank and settings, as far as they differ.
 
-    Limits and level come first: a board that cannot take them keeps its old bank. A duty limit that is too
-    low for the old bank alone comes after the new one, and limits by which that is refused do not stay.
+    Limits and level are set first, so that a board that refuses them keeps its old bank. A duty limit below
+    the old bank's duty is set after the new one; limits are restored if the new bank is refused.
 
     Raises:
-        BoardError: See `Board.limit`, `Board.program` and `Board.level`.
+        BoardError: See `Board.set_limits`, `Board.program` and `Board.set_level`.
         ConfigError: The bank does not fit the board.
     """
     if bank.rest is not None and settings.watchdog == Watchdog.IDLE:
@@ -585,42 +583,42 @@ def provision(
             "watchdog = idle: LEDs that are on for a chip of two say something in this link's framing;"
             " use dark, or keep"
         )
-    bank = board.fitted(bank)
+    bank = board.adapt_bank(bank)
     board.check_fits(bank)
     before = status = board.status()
     most_ma, duty = settings.level_limit_ma, settings.duty_limit
-    last = False
+    duty_last = False
     if duty is not None:
         board.check_duty("this payload", bank.duty, duty)
-        last = before.active_bank != NO_BANK and before.duty > round(1000 * duty)
-    if most_ma is not None or (duty is not None and not last):
-        board.limit(bank, most_ma, None if last else duty)
+        duty_last = before.active_bank != NO_BANK and before.duty > round(1000 * duty)
+    if most_ma is not None or (duty is not None and not duty_last):
+        board.set_limits(bank, most_ma, None if duty_last else duty)
         status = board.status()
     level = settings.level_ma
-    later = level is not None and status.level_ma != level and not _set_level(board, level)
+    level_last = level is not None and status.level_ma != level and not _try_level(board, level)
     wanted = (settings.watchdog, settings.watchdog_ms)
     if settings.watchdog is not None and (status.watchdog, status.watchdog_ms) != wanted:
-        board.watchdog(settings.watchdog, settings.watchdog_ms)
+        board.set_watchdog(settings.watchdog, settings.watchdog_ms)
     try:
         done = board.program(bank, verify, progress)
     except RefusedError:
         if (status.level_limit_ma, status.duty_limit) != (before.level_limit_ma, before.duty_limit):
-            board.limit(bank, before.level_limit_ma, before.duty_limit / 1000)
-            board.level(before.level_ma)
+            board.set_limits(bank, before.level_limit_ma, before.duty_limit / 1000)
+            board.set_level(before.level_ma)
         raise
-    if last:
-        board.limit(bank, None, duty)
-    if level is not None and later:
-        board.level(level)
+    if duty_last:
+        board.set_limits(bank, None, duty)
+    if level is not None and level_last:
+        board.set_level(level)
     if settings.start and status.state != State.PLAYING:
         board.start()
     return done
 
 
-def _set_level(board: Board, level_ma: int) -> bool:
-    """Set the LED current; False where it is too much for what plays, but perhaps not for what comes."""
+def _try_level(board: Board, level_ma: int) -> bool:
+    """Set the LED current; False if it is too high for the active bank, but perhaps not for the next one."""
     try:
-        board.level(level_ma)
+        board.set_level(level_ma)
     except RefusedError as fault:
         if fault.status != Status.TOO_BRIGHT:
             raise
@@ -629,7 +627,7 @@ def _set_level(board: Board, level_ma: int) -> bool:
 
 
 def profile_number(bank: Bank) -> int:
-    """The protocol's number of a bank's codebook; `custom` for one that the firmware was not built with."""
+    """The protocol's number of a bank's codebook; `CUSTOM` for one that is not built into the firmware."""
     if not bank.composed:
         return Profile.CUSTOM
     return next((p for p, digest in DIGESTS.items() if digest == bank.digest), Profile.CUSTOM)

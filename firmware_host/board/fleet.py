@@ -15,10 +15,10 @@ from evlcp_sdk.link.compose import encode_messages, encode_utf8, make_messages
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.specs import SpecError, build_spec, format_value, read_toml
-from firmware_host.board.bank import Bank, bank_of, random_packets, read_masks
+from firmware_host.board.bank import Bank, make_bank, random_packets, read_masks
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.keys import read_board_key
-from firmware_host.board.messages import site_that_sends
+from firmware_host.board.messages import choose_site
 from firmware_host.board.session import Session
 from firmware_host.board.symbols import read_symbols
 from firmware_host.emulators.opening import open_port
@@ -29,23 +29,23 @@ from firmware_host.protocol.generated.requests import DEFAULT_BAUD, Watchdog
 
 @dataclass(frozen=True)
 class Entry:
-    """One board of an inventory: what it plays, and what `Settings` has; paths begin at the inventory's.
+    """One board of an inventory: its payload and `Settings`; paths are relative to the inventory's.
 
     Attributes:
         id: Transmitter id, unique in the inventory.
         port: Port, as for `--port`, unique in the inventory.
         position_m: Coordinates x, y, z of the bar's centre, m.
         payload: Symbols `[packet][frame][cluster]` in a JSON file, or chip masks in a `.npy` file.
-        random: Instead of `payload`: that many packets of random symbols.
-        text: Instead of `payload`: a message, a text.
-        beacon: Instead of `payload`, or beside `text`: the file of sites whose bar's beacon it sends.
-        user: The beacon's own bytes, as text.
+        random: Instead of `payload`: number of packets of random symbols.
+        text: Instead of `payload`: a text message.
+        beacon: Instead of `payload`, or with `text`: the file of sites with the bar of the beacon.
+        user: The user's own bytes in the beacon, as text.
         key: File of the private key that signs the beacon.
-        transmitter_id: Number of the transmitter in its messages; without it the site's, or 0.
+        transmitter_id: Transmitter id in its messages; without it the site's, or 0.
         sequence: Number of its messages: raise it when they change.
-        repeat: How many times in a row each packet is sent.
+        repeat: Times in a row that each packet is sent.
         link: The link, a file or its tables. Without it a payload's own, or all defaults.
-        unique_id: The part's own number in hex, as `evlcp board hello` shows it; another board is refused.
+        unique_id: The part's unique id in hex, as `evlcp board hello` shows it; another board is refused.
         baud: Line rate, bit/s.
         board_key: File of the board's key.
 
@@ -93,7 +93,7 @@ class Entry:
 
     @property
     def settings(self) -> Settings:
-        """What the board is set to."""
+        """The board's settings."""
         watchdog = None if self.watchdog is None else Watchdog[self.watchdog.upper()]
         return Settings(
             self.level_ma, watchdog, self.watchdog_ms, self.start, self.level_limit_ma, self.duty_limit
@@ -102,7 +102,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class _Tables:
-    """An inventory as it is written."""
+    """The tables of an inventory file."""
 
     board: Annotated[list[dict[str, Any]], Field(min_length=1)]
     defaults: dict[str, Any] = field(default_factory=dict)
@@ -110,7 +110,7 @@ class _Tables:
 
 @dataclass(frozen=True)
 class Inventory:
-    """The boards of a file, and what each plays, by its id."""
+    """The boards of a file, and the bank of each by its id."""
 
     path: Path
     entries: tuple[Entry, ...]
@@ -118,7 +118,7 @@ class Inventory:
 
 
 def read_inventory(path: Path) -> Inventory:
-    """Read an inventory, with what each board plays.
+    """Read an inventory and the banks of its boards.
 
     Raises:
         ConfigError: See `read_entries`; or a link or a message is wrong, or a board cannot play it.
@@ -126,7 +126,7 @@ def read_inventory(path: Path) -> Inventory:
         IncompatibleError: A payload was made with another link.
     """
     entries, registry = read_entries(path), Registry.load()
-    banks = {entry.id: _bank(path, n, entry, registry) for n, entry in enumerate(entries)}
+    banks = {entry.id: _load_bank(path, n, entry, registry) for n, entry in enumerate(entries)}
     return Inventory(path, entries, banks)
 
 
@@ -139,15 +139,15 @@ def read_entries(path: Path) -> tuple[Entry, ...]:
     """
     try:
         tables = build_spec(_Tables, read_toml(path))
-    except SpecError as refused:
-        raise ConfigError("\n".join(refused.lines(f"{path}: "))) from refused
+    except SpecError as fault:
+        raise ConfigError("\n".join(fault.lines(f"{path}: "))) from fault
     entries = []
     for i, row in enumerate(tables.board):
         place = f"{path}: board[{i}]"
         try:
             entries.append(build_spec(Entry, tables.defaults | row))
-        except SpecError as refused:
-            raise ConfigError("\n".join(refused.lines(f"{place}."))) from refused
+        except SpecError as fault:
+            raise ConfigError("\n".join(fault.lines(f"{place}."))) from fault
         except ConfigError as fault:
             raise ConfigError(f"{place}: {fault}") from fault
     for key in ("id", "port"):
@@ -163,7 +163,7 @@ def read_entries(path: Path) -> tuple[Entry, ...]:
     return tuple(entries)
 
 
-def _bank(path: Path, index: int, entry: Entry, registry: Registry) -> Bank:
+def _load_bank(path: Path, index: int, entry: Entry, registry: Registry) -> Bank:
     folder, given, named = path.parent, None, entry.link
     try:
         if isinstance(named, str):
@@ -172,13 +172,13 @@ def _bank(path: Path, index: int, entry: Entry, registry: Registry) -> Bank:
             given = resolve(named, registry, source="link")
         if entry.payload is not None and not entry.payload.endswith(".npy"):
             symbols, link = read_symbols(folder / entry.payload, given, registry)
-            return bank_of(symbols, link)
+            return make_bank(symbols, link)
         link = given or resolve({}, registry)
         if entry.has_message:
-            return _message(folder, entry, link)
+            return _message_bank(folder, entry, link)
         if entry.payload is not None:
             return read_masks(folder / entry.payload, link)
-        return bank_of(random_packets(entry.random or 0, link, entry.seed), link)
+        return make_bank(random_packets(entry.random or 0, link, entry.seed), link)
     except EvlcpError as fault:
         kind = next(
             k for k in (IncompatibleError, InputError, ConfigError, EvlcpError) if isinstance(fault, k)
@@ -187,11 +187,11 @@ def _bank(path: Path, index: int, entry: Entry, registry: Registry) -> Bank:
         raise kind("\n".join(f"{place}: {line}" for line in str(fault).splitlines())) from fault
 
 
-def _message(folder: Path, entry: Entry, link: Link) -> Bank:
-    """The packets of a board's message."""
+def _message_bank(folder: Path, entry: Entry, link: Link) -> Bank:
+    """The bank of a board's message."""
     site = None
     if entry.beacon is not None:
-        site = site_that_sends(folder / entry.beacon, entry.transmitter_id, "transmitter_id")
+        site = choose_site(folder / entry.beacon, entry.transmitter_id, "transmitter_id")
     messages = make_messages(
         link,
         text=entry.text,
@@ -201,12 +201,12 @@ def _message(folder: Path, entry: Entry, link: Link) -> Bank:
         transmitter_id=entry.transmitter_id,
         sequence=entry.sequence,
     )
-    return bank_of(encode_messages(messages, link.block_coder(), entry.repeat), link)
+    return make_bank(encode_messages(messages, link.block_coder(), entry.repeat), link)
 
 
 @contextlib.contextmanager
-def board_of(entry: Entry, folder: Path) -> Iterator[Board]:
-    """The board of an entry of an inventory in a folder.
+def open_entry(entry: Entry, folder: Path) -> Iterator[Board]:
+    """Open the board of an inventory's entry; paths are relative to the folder.
 
     Raises:
         IncompatibleError: Another board is on its port.
@@ -217,7 +217,7 @@ def board_of(entry: Entry, folder: Path) -> Iterator[Board]:
     key = None if entry.board_key is None else read_board_key(folder / entry.board_key)
     with Session(open_port(entry.port, entry.baud), Timing(entry.baud), key=key) as session:
         board = Board(session)
-        found = board.about.unique_id.hex()
+        found = board.info.unique_id.hex()
         if entry.unique_id not in (None, found):
             raise IncompatibleError(
                 f"{entry.port}: unique_id {found}, the inventory expects {entry.unique_id};"
@@ -227,37 +227,37 @@ def board_of(entry: Entry, folder: Path) -> Iterator[Board]:
 
 
 Work = Callable[[Entry, Board], tuple[str, dict[str, Any]]]
-"""What is done with a board; what it did, for a person and as plain values."""
+"""Works on a board; returns the result as text and as plain values."""
 
 Report = Callable[[str, dict[str, Any]], None]
-"""Called with how each board ended, as it comes: a line for a person, and plain values."""
+"""Called with each board's result when it is done: a line of text, and plain values."""
 
 
 def run_fleet(path: Path, entries: Sequence[Entry], work: Work, report: Report) -> None:
-    """Do something with all boards of an inventory; one that fails does not hold up the others.
+    """Work on all boards of an inventory at once; one that fails does not stop the others.
 
     Raises:
         FleetError: A board failed; it has the exit code of the first of them.
     """
     codes: dict[str, int] = {}
 
-    def one(entry: Entry) -> tuple[str, dict[str, Any]]:
+    def run_entry(entry: Entry) -> tuple[str, dict[str, Any]]:
         start = time.monotonic()
         table, code, fault = dict[str, Any](), 0, None
         try:
-            with board_of(entry, path.parent) as board:
-                said, table = work(entry, board)
-        except EvlcpError as failed:
-            code, fault = failed.exit_code, str(failed)
+            with open_entry(entry, path.parent) as board:
+                summary, table = work(entry, board)
+        except EvlcpError as failure:
+            code, fault = failure.exit_code, str(failure)
             codes[entry.id] = code
-            said = f"FAILED ({code}): {fault}"
+            summary = f"FAILED ({code}): {fault}"
         elapsed_s = round(time.monotonic() - start, 3)
-        named = {"id": entry.id, "port": entry.port, "position_m": list(entry.position_m), "ok": not code}
-        ended = {"exit_code": code, "fault": fault, "elapsed_s": elapsed_s}
-        return f"{entry.id}  {entry.port}  {said}", named | table | ended
+        head = {"id": entry.id, "port": entry.port, "position_m": list(entry.position_m), "ok": not code}
+        result = {"exit_code": code, "fault": fault, "elapsed_s": elapsed_s}
+        return f"{entry.id}  {entry.port}  {summary}", head | table | result
 
     with ThreadPoolExecutor(min(64, len(entries))) as pool:
-        for future in as_completed([pool.submit(one, entry) for entry in entries]):
+        for future in as_completed([pool.submit(run_entry, entry) for entry in entries]):
             report(*future.result())
     failed = [entry.id for entry in entries if entry.id in codes]
     if failed:
@@ -269,7 +269,7 @@ def run_fleet(path: Path, entries: Sequence[Entry], work: Work, report: Report) 
 
 
 def program_fleet(inventory: Inventory, verify: bool, report: Report) -> None:
-    """Program all boards at once; faults as of `run_fleet`."""
+    """Program all boards at once; errors as of `run_fleet`."""
 
     def work(entry: Entry, board: Board) -> tuple[str, dict[str, Any]]:
         start = time.monotonic()

@@ -1,4 +1,4 @@
-"""Files of boards' keys: 32 hex digits, for their owner's eyes only."""
+"""Files of boards' keys: 32 hex digits, readable by their owner alone."""
 
 import secrets
 from pathlib import Path
@@ -12,7 +12,7 @@ _MOST_BYTES = 1024
 
 
 def make_board_key(path: Path) -> str:
-    """Make a key and write it; returns its name, 8 hex digits.
+    """Write a new key; return its name, 8 hex digits.
 
     Raises:
         OutputError: The file exists, or cannot be written.
@@ -26,7 +26,7 @@ def read_board_key(path: Path) -> bytes:
     """The key of a file.
 
     Raises:
-        InputError: The file cannot be read, others than its owner may use it, or it holds no key.
+        InputError: The file cannot be read, is accessible to others than its owner, or holds no key.
     """
     text = read_secret(path, _MOST_BYTES)
     try:

@@ -1,4 +1,4 @@
-"""Messages that a board sends: once, again and again, or anew every so often."""
+"""Messages that a board sends: once, repeatedly, or updated periodically."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Content:
-    """What is to be sent, some of which changes with the time.
+    """The content of messages, some of which changes with time.
 
     Attributes:
-        fixed: What does not: arguments of `make_messages`.
-        text: A text; where it is sent anew, `{time}`, `{left}` and `{n}` in it are filled in.
-        time: The time is sent.
-        ends_s: When what a signal shows ends, seconds since 1970.
-        signals: What it shows, and what then.
-        sequence: Number of the first.
+        fixed: The constant part: arguments of `make_messages`.
+        text: A text, with `{time}`, `{left}` and `{n}` filled in if it is sent periodically.
+        time: Whether the time is sent.
+        ends_s: End of a countdown, seconds since 1970.
+        signals: What a traffic light shows before and after it.
+        sequence: Number of the first message.
     """
 
     fixed: Mapping[str, Any]
@@ -43,8 +43,8 @@ class Content:
     signals: tuple[str, str]
     sequence: int
 
-    def at(self, link: Link, at_s: float, number: int | None = None) -> list[Message]:
-        """The messages of a time, seconds since 1970; of those sent anew, the ones of this number.
+    def messages_at(self, link: Link, at_s: float, number: int | None = None) -> list[Message]:
+        """The messages at a time, seconds since 1970, with a number if they are sent periodically.
 
         Raises:
             ConfigError: They do not fit.
@@ -61,16 +61,16 @@ class Content:
         return make_messages(link, **self.fixed, text=text, other=other, sequence=sequence)
 
 
-def site_that_sends(path: Path, transmitter_id: int | None, by: str) -> BarSite:
-    """The bar of a file of sites that sends: of an id, or the only one; `by` is how a person chooses one.
+def choose_site(path: Path, transmitter_id: int | None, option: str) -> BarSite:
+    """The bar with an id in a file of sites, or the only one; `option` is named for the choice in errors.
 
     Raises:
-        ConfigError: The file is wrong, or it is not clear which bar is meant.
+        ConfigError: The file is wrong, or the bar is not determined.
     """
     sites = load_sites(path)
     ids = ", ".join(str(s.transmitter_id) for s in sites)
     if transmitter_id is None and len(sites) > 1:
-        raise ConfigError(f"{path}: {len(sites)} bars: choose one with {by}, of {ids}")
+        raise ConfigError(f"{path}: {len(sites)} bars: choose one with {option}, of {ids}")
     chosen = [s for s in sites if transmitter_id in (None, s.transmitter_id)]
     if not chosen:
         raise ConfigError(f"{path}: no bar has transmitter_id {transmitter_id}, but {ids}")
@@ -78,17 +78,13 @@ def site_that_sends(path: Path, transmitter_id: int | None, by: str) -> BarSite:
 
 
 def packet_s(link: Link) -> float:
-    """How long a packet is on air, s."""
+    """Duration of a packet on air, s."""
     return link.packet.packet_chips / link.air.chip_rate_hz
 
 
 def check_interval(content: Content, link: Link, repeat: int, every_s: float) -> None:
-    """See that what is sent anew every so often takes no longer on air.
-
-    Raises:
-        ConfigError: It does.
-    """
-    many = len(encode_messages(content.at(link, clock_s(), 0), link.block_coder(), repeat))
+    """Raise ConfigError if messages take longer on air than the period in which they are sent."""
+    many = len(encode_messages(content.messages_at(link, clock_s(), 0), link.block_coder(), repeat))
     takes_s = many * packet_s(link)
     if takes_s > every_s:
         raise ConfigError(
@@ -98,7 +94,7 @@ def check_interval(content: Content, link: Link, repeat: int, every_s: float) ->
         )
 
 
-def send_anew(
+def send_periodically(
     stream: Stream,
     content: Content,
     link: Link,
@@ -107,17 +103,17 @@ def send_anew(
     count: int | None,
     stopped: Callable[[], bool],
 ) -> None:
-    """Send content anew every so often, until nothing is left of a countdown, or so many times.
+    """Send updated content every `every_s`, `count` times or until its countdown ends.
 
-    Each packet goes out `repeat` times in a row; `stopped` ends it.
+    Each packet is sent `repeat` times in a row; `stopped` is asked whether to end early.
     """
     coder = link.block_coder()
 
-    def next_one(number: int) -> Iterator[NDArray[np.int64]] | None:
+    def make_packets(number: int) -> Iterator[NDArray[np.int64]] | None:
         at_s = clock_s() + stream.delay_s
         over = content.ends_s is not None and number and at_s > content.ends_s + every_s
         if over or (count is not None and number >= count):
             return None
-        return iterate_packets(content.at(link, at_s, number), coder, repeat)
+        return iterate_packets(content.messages_at(link, at_s, number), coder, repeat)
 
-    stream.play(next_one, every_s, stopped)
+    stream.play(make_packets, every_s, stopped)

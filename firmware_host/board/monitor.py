@@ -1,4 +1,4 @@
-"""Looks at a board again and again, and finds it again when its line was gone."""
+"""Polls a board's status, and reconnects when its line was lost."""
 
 import contextlib
 import threading
@@ -16,22 +16,22 @@ _LONGEST_PAUSE_S = 5.0
 
 
 @dataclass(frozen=True)
-class Gone:
-    """The board does not answer; it is looked for until it does.
+class BoardGone:
+    """The board does not answer; it is tried again until it does.
 
     Attributes:
-        fault: Why.
+        fault: The reason.
     """
 
     fault: BoardError
 
 
 @dataclass(frozen=True)
-class Back:
+class BoardReturned:
     """The board answers again.
 
     Attributes:
-        after_s: How long it did not, s.
+        after_s: Time without an answer, s.
     """
 
     after_s: float
@@ -39,64 +39,64 @@ class Back:
 
 @dataclass(frozen=True)
 class KeyMissing:
-    """The board's watchdog acts all the same: it has a key, and this host speaks without."""
+    """The board's watchdog acts nevertheless: the board has a key, and this host does not use it."""
 
 
-def watch(
-    opened: Callable[[], AbstractContextManager[Board]],
+def watch_board(
+    open_board: Callable[[], AbstractContextManager[Board]],
     interval_s: float,
     count: int | None = None,
     reconnect: bool = True,
     at_first: bool = False,
     end: threading.Event | None = None,
-) -> Iterator[StatusReply | Gone | Back | KeyMissing]:
-    """What a board says, every `interval_s`; in between its watchdog does not act, as it hears of this host.
+) -> Iterator[StatusReply | BoardGone | BoardReturned | KeyMissing]:
+    """Yield a board's status every `interval_s`, and keep its watchdog from acting in between.
 
-    A board with a key hears only of a host that has it, too; otherwise `KeyMissing` comes once.
+    Only a host with the board's key can do that; without it `KeyMissing` is yielded once.
 
     Args:
-        opened: Opens the line to the board.
-        interval_s: Time between two looks, s.
-        count: End after so many.
-        reconnect: Whether to look for a board that is gone, at growing intervals of at most 5 s.
-        at_first: Whether to do so before it has answered for the first time, too.
+        open_board: Opens the line to the board.
+        interval_s: Time between two requests for the status, s.
+        count: Number of statuses; None for no end.
+        reconnect: Whether to reconnect to a lost board, at growing intervals of at most 5 s.
+        at_first: Whether to try so before its first answer, too.
         end: Ends it early, when set.
 
     Raises:
-        BoardError: The board is gone, and not looked for.
+        BoardError: The board is lost, and `reconnect` is False.
     """
     ended = end or threading.Event()
-    seen = 0
-    told = False
-    gone_s: float | None = None
+    yielded = 0
+    has_warned = False
+    lost_s: float | None = None
     pause_s = _FIRST_PAUSE_S
     with ExitStack() as stack:
         board: Board | None = None
         while not ended.is_set():
             try:
                 if board is None:
-                    board = stack.enter_context(opened())
+                    board = stack.enter_context(open_board())
                 status = board.status()
-                if gone_s is not None:
-                    yield Back(time.monotonic() - gone_s)
-                gone_s, pause_s = None, _FIRST_PAUSE_S
-                keyless = any(board.about.key_name) and board.session.key is None
-                if keyless and status.watchdog != Watchdog.KEEP and not told:
-                    told = True
+                if lost_s is not None:
+                    yield BoardReturned(time.monotonic() - lost_s)
+                lost_s, pause_s = None, _FIRST_PAUSE_S
+                keyless = any(board.info.key_name) and board.session.key is None
+                if keyless and status.watchdog != Watchdog.KEEP and not has_warned:
+                    has_warned = True
                     yield KeyMissing()
                 yield status
-                seen += 1
-                if seen == count:
+                yielded += 1
+                if yielded == count:
                     return
-                board.stay(interval_s, status)
+                board.wait_with_keep_alive(interval_s, status)
             except (LineError, NoBoardError) as fault:
                 board = None
                 with contextlib.suppress(BoardError):
                     stack.close()
-                if not reconnect or not (seen or at_first):
+                if not reconnect or not (yielded or at_first):
                     raise
-                if gone_s is None:
-                    gone_s = time.monotonic()
-                    yield Gone(fault)
+                if lost_s is None:
+                    lost_s = time.monotonic()
+                    yield BoardGone(fault)
                 ended.wait(pause_s)
                 pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)

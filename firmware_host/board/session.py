@@ -1,4 +1,4 @@
-"""A client on a line: requests are sent, answers awaited, refusals become errors that say what to do."""
+"""A session with a board: sends requests, waits for answers, and turns refusals into errors with advice."""
 
 import random
 from collections.abc import Callable, Iterable
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from evlcp_sdk.errors import OutputError
-from firmware_host.board.tables import name_of
+from firmware_host.board.tables import enum_name
 from firmware_host.errors import (
     BoardError,
     BoardResetError,
@@ -57,8 +57,8 @@ _KINDS: dict[int, type[BoardError]] = {
 }
 
 
-def refusal(name: str, type_: int, status: Status | int, detail: int) -> BoardError:
-    """The error for a request that a board refused; its message says why and what to do."""
+def make_refusal(name: str, type_: int, status: Status | int, detail: int) -> BoardError:
+    """The error for a request that a board refused, with the reason and advice."""
     request = protocol.Type(type_).name
     word = status.name if isinstance(status, Status) else f"status {status}"
     advice = _ADVICE.get(status, "update the host") if isinstance(status, Status) else "update the host"
@@ -78,15 +78,15 @@ class Session:
 
     Args:
         transport: The line; closed with the session.
-        timing: How long an answer may take.
-        first: First sequence number, by default drawn at random.
-        nonce: Number of the session, by default drawn at random.
-        tries: How often a request is sent before it is given up.
-        key: The board's key, which requests are sealed with if it has one.
+        timing: The time that an answer may take.
+        first: First sequence number, by default random.
+        nonce: Number of the session, by default random.
+        tries: Number of times that a request is sent.
+        key: The board's key, by which requests are sealed if the board has one.
         trace: File to record the line in.
 
     Attributes:
-        max_payload: Largest payload that the board takes, bytes; HELLO says it.
+        max_payload: Largest payload that the board takes, bytes, from HELLO.
 
     Raises:
         OutputError: The trace cannot be written; the line is closed.
@@ -118,7 +118,7 @@ class Session:
 
     @property
     def name(self) -> str:
-        """What to call the board in messages."""
+        """The board's name in messages."""
         return self.transport.name
 
     def __enter__(self) -> "Session":
@@ -146,7 +146,7 @@ class Session:
         found: list[RequestOutcome] = []
         request = protocol.HelloRequest(MAJOR, MINOR, self._nonce)
         try:
-            # Ends what a host before this one may have left half sent.
+            # Ends a datagram that an earlier host may have left incomplete.
             self.transport.write(b"\0")
             self.run([request], lambda _, outcome: found.append(outcome))
         except LineError as fault:
@@ -163,7 +163,7 @@ class Session:
                 advice = "another host may be connected to it: end that one; or the board behind it is off"
             raise NoBoardError(f"{self.name}: no board answers; {advice}")
         if not isinstance(outcome.reply, protocol.HelloReply):
-            raise refusal(self.name, protocol.Type.HELLO, outcome.status, outcome.detail)
+            raise make_refusal(self.name, protocol.Type.HELLO, outcome.status, outcome.detail)
         self.client.session = outcome.reply.session
         self.client.window = max(1, outcome.reply.window)
         self.max_payload = outcome.reply.max_payload
@@ -172,48 +172,48 @@ class Session:
         return outcome.reply
 
     def renew(self) -> protocol.HelloReply:
-        """Open another session; faults as of `hello`."""
+        """Open another session; errors as of `hello`."""
         self._nonce = (self._nonce + 1) & 0xFFFFFFFF
         return self.hello()
 
-    def _agree_on_key(self, about: protocol.HelloReply, token: int, known: Sealer | None) -> None:
-        """Seal what follows if the board has a key; without it its board can only be looked at."""
-        if not any(about.key_name) or self.key is None:
+    def _agree_on_key(self, info: protocol.HelloReply, token: int, known: Sealer | None) -> None:
+        """Seal further requests if both ends have the board's key; without it only its state can be read."""
+        if not any(info.key_name) or self.key is None:
             return
         own = key_name(self.key)
-        if own != about.key_name:
+        if own != info.key_name:
             raise RefusedError(
-                f"{self.name}: has the key {about.key_name.hex()}, this host's is {own.hex()};"
+                f"{self.name}: has the key {info.key_name.hex()}, this host's is {own.hex()};"
                 " give that board's with --key",
                 Status.BAD_SEAL,
             )
-        # numbers begin with that of the HELLO that opened the session
+        # numbers begin with that of the session's HELLO
         start = ((self.client.first + token) & 0xFFFF) - token
-        same = known is not None and known.challenge == about.challenge
-        self.client.sealer = known if same else Sealer(self.key, about.challenge, start)
-        self.max_payload = about.max_payload - protocol.SEAL_BYTES
+        same = known is not None and known.challenge == info.challenge
+        self.client.sealer = known if same else Sealer(self.key, info.challenge, start)
+        self.max_payload = info.max_payload - protocol.SEAL_BYTES
 
     def call(self, request: WireRequest[Reply]) -> Reply:
-        """One request and its answer.
+        """Send one request, and return its answer.
 
         Raises:
-            RefusedError: The board refuses; or the error that its status stands for.
-            LineError: No answer came.
+            RefusedError: The board refuses; or the error class of its status.
+            LineError: There is no answer.
         """
         replies: list[Reply] = []
         self.call_each([request], lambda _, reply: replies.append(reply))
         return replies[0]
 
     def call_each(self, requests: Iterable[WireRequest[Reply]], handle: Callable[[Any, Reply], None]) -> None:
-        """Many requests; `handle` gets each with its answer. Faults as of `call`, and of `handle`, end it."""
-        self.run(requests, lambda request, outcome: handle(request, self.checked(request, outcome)))
+        """Send many requests; `handle` gets each with its answer. Errors, as of `call`, end it."""
+        self.run(requests, lambda request, outcome: handle(request, self.expect_reply(request, outcome)))
 
-    def status_when(
+    def wait_for_status(
         self, done: Callable[[protocol.StatusReply], bool], timeout_s: float, pause_s: float = 0.005
     ) -> protocol.StatusReply:
-        """Status once it is as wanted; or, not so, when `timeout_s` and a packet are over."""
+        """The status when it fulfils `done`, or the last one after `timeout_s` and a packet."""
         status = self.call(protocol.StatusRequest())
-        # an older board's packet by its frames: a preamble of 32 chips at most, 32 a frame
+        # older firmware gives frames alone: at most a preamble of 32 chips, and 32 a frame
         packet_s = (status.packet_chips or 32 + 32 * status.frames) / status.chip_rate_hz
         end = self.transport.time_s() + timeout_s + packet_s
         while not done(status) and self.transport.time_s() <= end:
@@ -222,31 +222,31 @@ class Session:
         return status
 
     def wait_dark(self, timeout_s: float) -> protocol.StatusReply:
-        """Status once the LEDs are dark after a stop.
+        """Status when the LEDs are dark after a stop.
 
         Raises:
-            LineError: They are not within `timeout_s` and the packet that a stop finishes.
+            LineError: They are not within `timeout_s` and a packet.
         """
         ends = (State.DARK, State.FAULT)
-        status = self.status_when(lambda status: status.state in ends, timeout_s)
+        status = self.wait_for_status(lambda status: status.state in ends, timeout_s)
         if status.state not in ends:
-            state = name_of(State, status.state).upper()
+            state = enum_name(State, status.state).upper()
             raise LineError(f"{self.name}: still {state}; try 'evlcp board blank'")
         return status
 
-    def _check_known(self, request: WireRequest[Any]) -> None:
+    def _check_supported(self, request: WireRequest[Any]) -> None:
         """Raise IncompatibleError if the board's protocol is too old for a request."""
-        later = request.find_unsupported(self.client.minor)
-        if later is None:
+        part = request.find_unsupported(self.client.minor)
+        if part is None:
             return
-        what = protocol.Type(request.TYPE).name + ("" if later == "it" else f" with {later}")
+        what = protocol.Type(request.TYPE).name + ("" if part == "it" else f" with {part}")
         raise IncompatibleError(
             f"{self.name}: {what} is not in its protocol {MAJOR}.{self.client.minor}, this host has"
             f" {MAJOR}.{MINOR}; update the firmware"
         )
 
-    def checked(self, request: WireRequest[Reply], outcome: RequestOutcome) -> Reply:
-        """The answer of an outcome.
+    def expect_reply(self, request: WireRequest[Reply], outcome: RequestOutcome) -> Reply:
+        """The answer in an outcome.
 
         Raises:
             BoardError: There is none; see `call`.
@@ -257,14 +257,14 @@ class Session:
                 " check the line and run the command again"
             )
         if outcome.reply is None:
-            raise refusal(self.name, request.TYPE, outcome.status, outcome.detail)
+            raise make_refusal(self.name, request.TYPE, outcome.status, outcome.detail)
         return cast(Reply, outcome.reply)
 
     def run(self, requests: Iterable[Request], handle: Callable[[Request, RequestOutcome], None]) -> None:
         """Send requests, as many at once as the board takes; `handle` gets each with its outcome.
 
-        The next of `requests` is asked for when there is room for it, so that a generator may go by what has
-        come in. What `handle` raises ends the run.
+        Each is taken from `requests` when there is room for it, so that a generator may depend on earlier
+        outcomes. An error of `handle` ends the run.
 
         Raises:
             LineError: The line went away.
@@ -279,7 +279,7 @@ class Session:
                     if request is None:
                         more = False
                     else:
-                        self._check_known(request)
+                        self._check_supported(request)
                         sent[self.client.submit(request)] = request
                 data, deadline = self.client.poll(self.transport.time_s())
                 if data:

@@ -1,4 +1,4 @@
-"""Several bars in step: one START at the same pulse of a clock that all of them see."""
+"""Several bars in step: a START at the same pulse of a common clock."""
 
 import contextlib
 from collections.abc import Sequence
@@ -13,22 +13,22 @@ _ROUNDS = 20
 def start_together(boards: Sequence[Board], pulse_hz: int = 1) -> list[int]:
     """Start boards at the same pulse; each stays in step with the pulses from then on.
 
-    Boards count pulses from their own reset. A pulse is the same for all if between two readings of every
-    board's count none has changed.
+    Boards count pulses from their own reset. Their counts belong to the same pulse if none has changed
+    between two readings of all.
 
     Args:
-        boards: The boards, dark; they must take all their STARTs within half a second.
+        boards: The boards, dark; they must take all STARTs within half a second.
         pulse_hz: Pulses a second; must divide the chip rates.
 
     Returns:
-        The pulse of each board, as it counts them.
+        The pulse in each board's count.
 
     Raises:
         RefusedError: A board has no pulse input, plays, or refuses; then all are stopped.
-        LineError: Pulses come faster than the boards can be asked.
+        LineError: Pulses are faster than the boards' answers.
     """
     for board in boards:
-        if not board.about.capabilities & Capability.PULSE:
+        if not board.info.capabilities & Capability.PULSE:
             raise RefusedError(
                 f"{board.session.name}: has no pulse input; 'evlcp board hello' shows what it can",
                 Status.NOT_SUPPORTED,
@@ -56,10 +56,10 @@ def start_together(boards: Sequence[Board], pulse_hz: int = 1) -> list[int]:
 
 
 def wait_for_pulse(boards: Sequence[Board], timeout_s: float) -> None:
-    """Wait until boards that `start_together` has armed play; those that do not are stopped.
+    """Wait until boards that `start_together` has armed play.
 
     Raises:
-        LineError: They do not within `timeout_s`.
+        LineError: They do not within `timeout_s`; all are stopped.
     """
     line = boards[0].session.transport
     end = line.time_s() + timeout_s
@@ -71,9 +71,9 @@ def wait_for_pulse(boards: Sequence[Board], timeout_s: float) -> None:
                 with contextlib.suppress(BoardError):
                     board.stop()
             names = (board.session.name for board in waiting)
-            told = ", ".join(map("{} has counted {}".format, names, pulses))
+            counts = ", ".join(map("{} has counted {}".format, names, pulses))
             raise LineError(
                 f"{waiting[0].session.name}: the pulse that it waits for has not come in {timeout_s:g} s"
-                f" (pulses since reset: {told}): check the wire of the pulse input; all are stopped"
+                f" (pulses since reset: {counts}): check the wire of the pulse input; all are stopped"
             )
         line.read(min(0.02, max(0.0, end - line.time_s())))

@@ -1,4 +1,4 @@
-"""Packets onto a board as they come: a queue on the board, filled without waiting for each answer."""
+"""A stream of packets: a queue on the board that is filled without waiting for each answer."""
 
 from bisect import insort
 from collections.abc import Callable, Iterable
@@ -18,8 +18,8 @@ from firmware_host.errors import BoardError, LineError
 from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.generated.requests import PushRequest, StopRequest
 
-AHEAD = 4
-"""Packets that wait on the board, the one that plays among them, unless the caller says otherwise."""
+DEFAULT_AHEAD = 4
+"""Default number of packets on the board, the playing one included."""
 
 _PIECE_OVERHEAD = PushRequest.min_bytes()
 _DARK_S = 10.0
@@ -27,7 +27,7 @@ _DARK_S = 10.0
 
 @dataclass(frozen=True, order=True)
 class _Piece:
-    """A piece of a packet on its way."""
+    """A piece of a packet."""
 
     number: int
     offset: int
@@ -36,31 +36,31 @@ class _Piece:
 
     @property
     def after(self) -> tuple[int, int]:
-        """Where the board stands when it has taken it."""
+        """The board's position in the queue after this piece."""
         return (self.number + 1, 0) if self.ends else (self.number, self.offset + len(self.data))
 
 
 class Stream:
     """A board's queue of packets; `Board.stream` makes one.
 
-    `send` puts a packet in; the board plays it after those before it, and shows its idle pattern while it
-    has none. If the link's framing says what LEDs do meanwhile, a packet of that waits whenever nothing else
-    does, so that the board is never without. As a context manager it ends in the dark: after the last packet,
-    or, if something was raised, after the one that plays.
+    `send` adds a packet; the board plays it after the earlier ones, and shows its idle pattern while the
+    queue is empty. If the link's framing determines the LEDs' state meanwhile, pauses of that state keep the
+    queue from being empty. As a context manager it ends in the dark: after the last packet, or, if something
+    was raised, after the playing one.
 
     Args:
         session: The session with the board; nothing else may use it meanwhile.
         bank: Number of the bank that is the queue.
-        like: What is in it, as `bank.queue_of` makes it.
-        ahead: Packets that wait on the board, the one that plays among them: few for a short delay, many for
-            a host that may be held up.
-        pulse_s: How long the board may hear nothing, s.
+        template: The link's bank without packets, from `bank.make_queue`.
+        ahead: Packets on the board, the playing one included: few for a short delay, many for a host that may
+            stall.
+        pulse_s: Longest time between two requests, s.
 
     Attributes:
-        sent: Packets that were given to `send`.
-        pauses: Packets of pause that were put in.
-        begun: Packets that have begun to play, pauses among them, as far as the board has said.
-        underruns: How often the board had none to play, as far as it has said.
+        sent: Packets given to `send`.
+        pauses: Pauses added, in packets.
+        begun: Packets that have begun to play, pauses included, by the last reply.
+        underruns: Times that the queue was empty, by the last reply.
         requests: Requests sent, repeated ones included.
     """
 
@@ -68,39 +68,39 @@ class Stream:
         self,
         session: Session,
         bank: int,
-        like: Bank,
+        template: Bank,
         ahead: int,
         pulse_s: float,
     ) -> None:
         self._session = session
         self._bank = bank
-        self._like = like
+        self._template = template
         self._ahead = ahead
         self._pulse_s = pulse_s
-        self._pause = None
-        if like.rest is not None:
-            shape = (like.packet.packet_chips, like.clusters)
-            self._pause = like.encode(np.full(shape, like.rest, np.uint8))
-        self._room = session.max_payload - _PIECE_OVERHEAD
+        self._pause_packet = None
+        if template.rest is not None:
+            shape = (template.packet.packet_chips, template.clusters)
+            self._pause_packet = template.encode(np.full(shape, template.rest, np.uint8))
+        self._piece_bytes = session.max_payload - _PIECE_OVERHEAD
         self._retries = session.client.retries
         self._submitted = 0
         self._pieces: list[_Piece] = []
-        self._flight: dict[int, tuple[_Piece | None, PushRequest]] = {}
+        self._in_flight: dict[int, tuple[_Piece | None, PushRequest]] = {}
         self._position = (0, 0)
-        self.packet_s = like.packet.packet_chips / like.chip_rate_hz
-        self._heard_s = session.transport.time_s()
-        self._hold_s = self._heard_s
-        # the latest at which the newest packet that is known to have begun did so; the first begins at once
-        self._begun_s = self._heard_s - self.packet_s
+        self.packet_s = template.packet.packet_chips / template.chip_rate_hz
+        self._last_reply_s = session.transport.time_s()
+        self._blocked_until_s = self._last_reply_s
+        # latest possible start of the newest packet that has begun; the first begins at once
+        self._begun_s = self._last_reply_s - self.packet_s
         self.sent = 0
         self.pauses = 0
         self.begun = 0
         self.underruns = 0
-        if self._pause is not None:
-            # Before the board starts: it begins with a pause.
-            self._pump(0.0)
-            while self._pieces or self._flight:
-                self._pump(self._pulse_s)
+        if self._pause_packet is not None:
+            # The board starts with a pause.
+            self._exchange(0.0)
+            while self._pieces or self._in_flight:
+                self._exchange(self._pulse_s)
 
     def __enter__(self) -> Self:
         return self
@@ -120,21 +120,21 @@ class Stream:
 
     @property
     def delay_s(self) -> float:
-        """How long a packet that is sent now waits for its first chip, as far as can be told, s."""
-        begins_s = self._begun_s + (self._next - self.begun + 1) * self.packet_s
+        """Expected time until the first chip of a packet that is sent now, s."""
+        begins_s = self._begun_s + (self._next_number - self.begun + 1) * self.packet_s
         return max(0.0, begins_s - self._session.transport.time_s())
 
     def play(
         self,
-        make: Callable[[int], Iterable[ArrayLike] | None],
+        make_packets: Callable[[int], Iterable[ArrayLike] | None],
         every_s: float,
         stopped: Callable[[], bool] = lambda: False,
     ) -> int:
-        """Send messages that change: each round and round until it is time for the next; how many there were.
+        """Send changing messages, each repeatedly until the next is due; return their number.
 
         Args:
-            make: The packets of the message of a number, from 0 on, for now plus `delay_s`; None ends it. An
-                iterator that makes each when it is taken holds nothing up.
+            make_packets: Gives the packets of a message by its number, from 0 on, to be on air after
+                `delay_s`, or None to end; an iterator that encodes each on demand avoids delays.
             every_s: Time between two messages, s; one whose packets take longer is sent once.
             stopped: Asked before each packet whether to end early.
 
@@ -143,7 +143,7 @@ class Stream:
         """
         line = self._session.transport
         due_s, number = line.time_s(), 0
-        while not stopped() and (packets := make(number)) is not None:
+        while not stopped() and (packets := make_packets(number)) is not None:
             number += 1
             due_s = max(due_s + every_s, line.time_s())
             sent = []
@@ -156,136 +156,138 @@ class Stream:
         return number
 
     def send(self, symbols: ArrayLike) -> int:
-        """Send one packet; returns its number, from 0 on, as soon as it is on the line.
+        """Send one packet, symbols (frames, clusters); return its number, from 0, when it is on the line.
 
         Waits while `ahead` packets are on the board.
 
-        Args:
-            symbols: Symbols (frames, clusters).
-
         Raises:
-            ConfigError: They are not a packet of the link.
+            ConfigError: The symbols are not a packet of the link.
             BoardError: The line or the board fails.
         """
-        packet, like = np.asarray(symbols), self._like
-        shape = (like.packet.frames, like.clusters)
+        packet, template = np.asarray(symbols), self._template
+        shape = (template.packet.frames, template.clusters)
         if packet.shape != shape:
             raise ConfigError(f"symbols of shape {packet.shape}, expected {shape}: frames, clusters")
-        number = self._put(like.encode(packet_chips(packet, like.codebook, like.packet.pilot_every)))
+        chips = packet_chips(packet, template.codebook, template.packet.pilot_every)
+        number = self._queue_packet(template.encode(chips))
         self.sent += 1
         while self._pieces and self._pieces[0].number <= number:
-            self._pump(self._pulse_s)
-            self._look()
+            self._exchange(self._pulse_s)
+            self._request_position()
         return self.sent - 1
 
     @property
-    def _next(self) -> int:
-        """The number on the line of the next packet."""
+    def _next_number(self) -> int:
+        """Number of the next packet in the queue."""
         return self.sent + self.pauses
 
-    def _put(self, content: bytes) -> int:
-        """Let a packet wait for its turn; the number on the line is returned."""
-        number = self._next
-        for at in range(0, len(content), self._room):
-            data = content[at : at + self._room]
+    def _queue_packet(self, content: bytes) -> int:
+        """Queue a packet to be sent; return its number in the queue."""
+        number = self._next_number
+        for at in range(0, len(content), self._piece_bytes):
+            data = content[at : at + self._piece_bytes]
             self._pieces.append(_Piece(number, at, data, at + len(data) == len(content)))
         return number
 
     def wait(self, seconds: float) -> None:
-        """Wait, and let the board hear of this host, so that its watchdog does not act.
+        """Wait, with requests often enough that the board's watchdog does not act.
 
         Raises:
             BoardError: The line or the board fails.
         """
         end = self._session.transport.time_s() + seconds
         while (left := end - self._session.transport.time_s()) > 0.0:
-            self._pump(min(left, self._pulse_s))
-            self._look()
+            self._exchange(min(left, self._pulse_s))
+            self._request_position()
 
     def close(self) -> None:
-        """Play what was sent to its end, then dark.
+        """Play all sent packets to their end, then go dark.
 
         Raises:
             BoardError: The line or the board fails.
         """
-        self._pause = None
-        while self._pieces or self._flight:
-            self._pump(self._pulse_s)
-        if self._position != (self._next, 0):
+        self._pause_packet = None
+        while self._pieces or self._in_flight:
+            self._exchange(self._pulse_s)
+        if self._position != (self._next_number, 0):
             raise LineError(f"{self._session.name}: the board's queue lost a packet; send it again")
-        self._submit(None, PushRequest(self._bank, self._next, 0, 1, b""))
-        while self._flight:
-            self._pump(self._pulse_s)
-        self._session.wait_dark((self._next - self.begun + 1) * self.packet_s + _DARK_S)
+        self._submit(None, PushRequest(self._bank, self._next_number, 0, 1, b""))
+        while self._in_flight:
+            self._exchange(self._pulse_s)
+        self._session.wait_dark((self._next_number - self.begun + 1) * self.packet_s + _DARK_S)
 
     def stop(self) -> None:
-        """Dark after the packet that plays; those that wait are not played."""
-        self._pause = None
+        """Go dark after the playing packet; waiting ones are dropped."""
+        self._pause_packet = None
         self._pieces.clear()
-        self._flight.clear()
+        self._in_flight.clear()
         self._session.client.drop_requests()
         self._session.call(StopRequest())
         self._session.wait_dark(self.packet_s + _DARK_S)
 
-    # -- what is on its way
+    # -- requests
 
-    def _look(self) -> None:
-        """Ask how the queue stands if nothing was heard for long."""
-        if not self._flight and self._session.transport.time_s() - self._heard_s >= self._pulse_s:
+    def _request_position(self) -> None:
+        """Request the queue's position if there was no reply for long."""
+        if not self._in_flight and self._session.transport.time_s() - self._last_reply_s >= self._pulse_s:
             self._submit(None, PushRequest(self._bank, *self._position, 0, b""))
 
     def _submit(self, piece: _Piece | None, request: PushRequest) -> None:
-        self._flight[self._session.client.submit(request)] = (piece, request)
+        self._in_flight[self._session.client.submit(request)] = (piece, request)
         self._submitted += 1
 
-    def _free_s(self, number: int, ahead: int) -> float:
-        """When a packet may go out, so that `ahead` are on the board with it."""
+    def _earliest_send_s(self, number: int, ahead: int) -> float:
+        """Earliest time to send a packet so that at most `ahead` are on the board, s."""
         missing = number - ahead + 2 - self.begun
-        return self._hold_s if missing <= 0 else max(self._hold_s, self._begun_s + missing * self.packet_s)
+        return (
+            self._blocked_until_s
+            if missing <= 0
+            else max(self._blocked_until_s, self._begun_s + missing * self.packet_s)
+        )
 
-    def _pump(self, wait_s: float) -> None:
-        """Send what may go out, and read for at most `wait_s`."""
+    def _exchange(self, wait_s: float) -> None:
+        """Send all pieces that are due, and read for at most `wait_s`."""
         client, line = self._session.client, self._session.transport
-        now = line.time_s()
-        free = now + wait_s
-        if self._pause is not None and not self._pieces:
-            free = self._free_s(self._next, 2)
-            if free <= now:
-                self._put(self._pause)
+        now_s = line.time_s()
+        due_s = now_s + wait_s
+        if self._pause_packet is not None and not self._pieces:
+            due_s = self._earliest_send_s(self._next_number, 2)
+            if due_s <= now_s:
+                self._queue_packet(self._pause_packet)
                 self.pauses += 1
         while self._pieces and client.has_room:
-            free = self._free_s(self._pieces[0].number, self._ahead)
-            if free > now:
+            due_s = self._earliest_send_s(self._pieces[0].number, self._ahead)
+            if due_s > now_s:
                 break
             piece = self._pieces.pop(0)
             self._submit(piece, PushRequest(self._bank, piece.number, piece.offset, 0, piece.data))
-            free = now + wait_s
-        data, deadline = client.poll(now)
+            due_s = now_s + wait_s
+        data, deadline = client.poll(now_s)
         if data:
             line.write(data)
-        end = min(free, now + wait_s, now + wait_s if deadline is None else deadline)
-        # a packet that has gone out is not waited for
+        end = min(due_s, now_s + wait_s, now_s + wait_s if deadline is None else deadline)
+        # no wait after a packet is out
         done = not self._pieces and client.has_room and bool(data)
         received = line.read(0.0 if done else max(0.0, end - line.time_s()))
         for outcome in client.receive(received, line.time_s()):
-            self._take(outcome)
+            self._handle_outcome(outcome)
 
-    def _take(self, outcome: RequestOutcome) -> None:
-        piece, request = self._flight.pop(outcome.token)
-        reply = self._session.checked(request, outcome)
-        now = self._session.transport.time_s()
+    def _handle_outcome(self, outcome: RequestOutcome) -> None:
+        piece, request = self._in_flight.pop(outcome.token)
+        reply = self._session.expect_reply(request, outcome)
+        now_s = self._session.transport.time_s()
         self._position = max(self._position, (reply.number, reply.offset))
         if reply.begun > self.begun:
-            # packets follow each other without a gap, unless the board had none
+            # packets follow each other without a gap unless the queue was empty
             next_s = self._begun_s + (reply.begun - self.begun) * self.packet_s
-            self._begun_s = min(now, next_s) if self.begun and reply.underruns == self.underruns else now
+            self._begun_s = min(now_s, next_s) if self.begun and reply.underruns == self.underruns else now_s
             self.begun = reply.begun
         else:
             # none has begun since
-            self._begun_s = max(self._begun_s, now - self.packet_s)
+            self._begun_s = max(self._begun_s, now_s - self.packet_s)
         self.underruns = reply.underruns
-        self._heard_s = now
+        self._last_reply_s = now_s
         if piece is not None and piece.after > self._position:
-            # it came before one that was lost, or there was no room
+            # an earlier piece was lost, or there was no room
             insort(self._pieces, piece)
-            self._hold_s = now + self.packet_s / 4.0
+            self._blocked_until_s = now_s + self.packet_s / 4.0

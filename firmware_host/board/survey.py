@@ -1,4 +1,4 @@
-"""Finds boards: lists the serial ports, and asks HELLO of those that may have one."""
+"""Finds boards: lists the serial ports, and sends HELLO to those that may have one."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,55 +14,55 @@ _PROBE_TRIES = 2
 
 
 @dataclass(frozen=True)
-class Found:
-    """A port, whether anything was written to it, and the HELLO that came, or why none did."""
+class SurveyedPort:
+    """A port, whether HELLO was sent to it, and the answer, or the reason why there is none."""
 
     port: SerialPort
     asked: bool
-    about: HelloReply | None
+    info: HelloReply | None
     fault: str
 
 
-def survey(
+def survey_ports(
     baud: int, ports: list[SerialPort] | None = None, usb: UsbFilter | None = None, every: bool = False
-) -> list[Found]:
-    """List serial ports, and ask those at once that may have a board.
+) -> list[SurveyedPort]:
+    """List serial ports, and send HELLO to those that may have a board, all at once.
 
-    A port is left alone unless its USB id is a bridge's that boards usually have: who knows what hangs
-    on another.
+    Nothing is written to a port unless its USB id is that of a bridge that boards usually have, as any other
+    device may be there.
 
     Args:
         baud: Line rate, bit/s.
         ports: The ports; by default all of this machine.
-        usb: List and ask only ports with this USB id.
-        every: Ask all that are listed.
+        usb: List only ports with this USB id, and send to all of them.
+        every: Send to all listed ports.
     """
     listed = [p for p in (serial_ports() if ports is None else ports) if usb is None or usb.matches(p)]
     if not listed:
         return []
 
-    def look(port: SerialPort) -> Found:
+    def probe(port: SerialPort) -> SurveyedPort:
         if not (every or usb is not None or port.has_common_bridge):
-            return Found(port, False, None, "no USB id of a board's bridge: not asked")
+            return SurveyedPort(port, False, None, "no USB id of a board's bridge: not asked")
         try:
             line = open_transport(port.device, baud)
             with Session(line, Timing(baud, latency_s=0.15), tries=_PROBE_TRIES) as session:
-                return Found(port, True, session.hello(), "")
+                return SurveyedPort(port, True, session.hello(), "")
         except BoardError as fault:
-            return Found(port, True, None, str(fault))
+            return SurveyedPort(port, True, None, str(fault))
 
     with ThreadPoolExecutor(len(listed)) as pool:
-        return list(pool.map(look, listed))
+        return list(pool.map(probe, listed))
 
 
-def find(baud: int, ports: list[SerialPort] | None = None) -> str:
-    """The port of the one board that answers, of those that may have one.
+def find_board_port(baud: int, ports: list[SerialPort] | None = None) -> str:
+    """The port of the only board that answers.
 
     Raises:
         NoBoardError: None answers, or several do.
     """
-    found = survey(baud, ports)
-    boards = [f for f in found if f.about is not None]
+    found = survey_ports(baud, ports)
+    boards = [f for f in found if f.info is not None]
     if len(boards) == 1:
         return boards[0].port.device
     if boards:

@@ -1,7 +1,7 @@
-"""Files of symbols, with the link that they are sent with.
+"""Files of symbols and their link.
 
 JSON: a list `[packet][frame][cluster]`, or an object with `symbols` and, as `evlcp tx` writes it, `link` (the
-tables of the link that are on air) and `codebook`; further keys are not read.
+link's tables that determine the light) and `codebook`; further keys are ignored.
 """
 
 import json
@@ -19,7 +19,7 @@ from evlcp_sdk.plugin.registry import Registry
 from firmware_host.errors import IncompatibleError
 
 ON_AIR = ("air", "bar", "framing", "pilots", "modulation")
-"""Tables of a link that symbols and chips follow from; blocks follow from the error correction, too."""
+"""Tables of a link that determine symbols and chips; blocks depend on the error correction, too."""
 
 _CORRECTION = "error-correction"
 
@@ -27,12 +27,12 @@ Symbols = NDArray[np.int64]
 
 
 def symbols_table(symbols: Symbols, link: Link, *, messages: bool = False) -> dict[str, Any]:
-    """What a file of symbols holds; plain values.
+    """The content of a file of symbols, plain values.
 
     Args:
         symbols: Symbols, int64 (packets, frames, clusters).
-        link: What they are sent with.
-        messages: They carry messages, so that the error correction counts.
+        link: Their link.
+        messages: Whether they carry messages, so that the error correction counts.
     """
     tables = (*ON_AIR, _CORRECTION) if messages else ON_AIR
     return {
@@ -43,12 +43,12 @@ def symbols_table(symbols: Symbols, link: Link, *, messages: bool = False) -> di
 
 
 def read_symbols(path: Path, link: Link | None, registry: Registry | None = None) -> tuple[Symbols, Link]:
-    """Symbols of a file, int64 (packets, frames, clusters), and the link that they are sent with.
+    """Symbols of a file, int64 (packets, frames, clusters), and their link.
 
     Args:
         path: The file.
-        link: The link that the user names; None for the file's own, or all defaults if it has none.
-        registry: Where algorithms are found; None for all that are installed.
+        link: The user's link; None for the file's own, or all defaults if it has none.
+        registry: The algorithms; None for all that are installed.
 
     Raises:
         IncompatibleError: The file was made with another link, or with other codes than those of its link.
@@ -58,16 +58,16 @@ def read_symbols(path: Path, link: Link | None, registry: Registry | None = None
     table = read_json(path)
     if isinstance(table, dict):
         if "link" in table:
-            link = _own_link(path, table, link, registry)
+            link = _load_link(path, table, link, registry)
         if "symbols" not in table:
             raise InputError(f"{path}: key symbols is missing, expected symbols[packet][frame][cluster]")
         table = table["symbols"]
     if link is None:
         link = resolve({}, registry)
-    return symbols_of(path, table, link), link
+    return parse_symbols(path, table, link), link
 
 
-def _own_link(path: Path, table: dict[str, Any], given: Link | None, registry: Registry | None) -> Link:
+def _load_link(path: Path, table: dict[str, Any], given: Link | None, registry: Registry | None) -> Link:
     tables = table["link"]
     if not isinstance(tables, dict):
         raise InputError(f"{path}: link = {json.dumps(tables)[:40]}, expected the tables of a link")
@@ -90,19 +90,19 @@ def _own_link(path: Path, table: dict[str, Any], given: Link | None, registry: R
     return own
 
 
-def symbols_of(path: Path, packets: Any, link: Link) -> Symbols:
-    """Symbols of a list `[packet][frame][cluster]`, int64; `path` is what faults name.
+def parse_symbols(path: Path, packets: Any, link: Link) -> Symbols:
+    """Symbols from a list `[packet][frame][cluster]`, int64; errors name `path`.
 
     Raises:
         InputError: An element is missing, out of range or not an integer; the message names the place.
     """
     book, frames = link.codebook, link.packet.frames
     place, top = "symbols", len(book.codewords) - 1
-    _list(path, place, packets, "packets")
+    _check_list(path, place, packets, "packets")
     for p, packet in enumerate(packets):
-        _list(path, f"{place}[{p}]", packet, "frames", frames, "air.frames_per_packet")
+        _check_list(path, f"{place}[{p}]", packet, "frames", frames, "air.frames_per_packet")
         for f, frame in enumerate(packet):
-            _list(path, f"{place}[{p}][{f}]", frame, "symbols", book.clusters, "one per cluster")
+            _check_list(path, f"{place}[{p}][{f}]", frame, "symbols", book.clusters, "one per cluster")
             for k, symbol in enumerate(frame):
                 if type(symbol) is not int or not 0 <= symbol <= top:
                     raise InputError(
@@ -112,7 +112,9 @@ def symbols_of(path: Path, packets: Any, link: Link) -> Symbols:
     return np.array(packets, np.int64)
 
 
-def _list(path: Path, place: str, value: Any, of: str, length: int | None = None, why: str = "") -> None:
+def _check_list(
+    path: Path, place: str, value: Any, of: str, length: int | None = None, why: str = ""
+) -> None:
     if not isinstance(value, list) or not value or (length is not None and len(value) != length):
         found = f"{len(value)} elements" if isinstance(value, list) else json.dumps(value)[:40]
         wanted = f"a list of {of}" if length is None else f"{length} {of}, {why}"

@@ -1,4 +1,4 @@
-"""Another firmware for a board in the field: over its line, on trial first, and back if it does not start."""
+"""Updates of a board's firmware over its line: on trial first, with a fallback if it does not start."""
 
 import base64
 import json
@@ -12,7 +12,7 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.files import read_json
 from firmware_host import build
 from firmware_host.board.board import Board, Progress
-from firmware_host.board.tables import about_table
+from firmware_host.board.tables import info_table
 from firmware_host.errors import BoardError, IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.images import FlashImage
 from firmware_host.protocol.generated import requests as protocol
@@ -25,20 +25,20 @@ _NO_UPDATE = (
 
 
 @dataclass(frozen=True)
-class Package:
-    """A firmware for both places of updates.
+class UpdatePackage:
+    """A firmware, linked for both places of updates.
 
     Attributes:
         target: Part and crystal.
-        images: What stands in place 1 and 2.
+        images: The images for places 1 and 2.
     """
 
     target: str
     images: Mapping[int, bytes]
 
     @classmethod
-    def built(cls, target: str) -> Self:
-        """Build it for a target of `build.TARGETS`.
+    def build(cls, target: str) -> Self:
+        """Build the firmware for a target of `build.TARGETS`.
 
         Raises:
             ToolchainError: The cross compiler is missing, or fails.
@@ -48,7 +48,7 @@ class Package:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read a file that `to_json` made.
+        """Read a file with the text of `to_json`.
 
         Raises:
             InputError: It cannot be read, or is no such file.
@@ -67,7 +67,7 @@ class Package:
         return cls(table["target"], images)
 
     def to_json(self) -> str:
-        """As the text of a file."""
+        """The package as the text of a file."""
         table = {
             "evlcp_update": 1,
             "target": self.target,
@@ -78,14 +78,14 @@ class Package:
 
 
 @dataclass(frozen=True)
-class Updated:
-    """What an update did.
+class UpdateResult:
+    """The result of an update.
 
     Attributes:
-        image: The image that runs, 1 or 2.
+        image: The running image, 1 or 2.
         length: Its bytes.
         sequence: Number of the update.
-        firmware: Version of the firmware that runs.
+        firmware: Version of the running firmware.
     """
 
     image: int
@@ -95,12 +95,12 @@ class Updated:
 
 
 def update_status(board: Board) -> protocol.UpdateStatusReply:
-    """Which image of the firmware runs.
+    """State of the firmware's images.
 
     Raises:
         RefusedError: The board takes no updates.
     """
-    if not board.about.capabilities & Capability.UPDATE:
+    if not board.info.capabilities & Capability.UPDATE:
         raise RefusedError(
             f"{board.session.name}: takes no updates over its line; 'evlcp board flash' instead",
             Status.NOT_SUPPORTED,
@@ -108,25 +108,29 @@ def update_status(board: Board) -> protocol.UpdateStatusReply:
     return board.session.call(protocol.UpdateStatusRequest())
 
 
-def confirm(board: Board) -> None:
-    """Keep the image that runs on trial."""
+def confirm_update(board: Board) -> None:
+    """End the trial of the running image and keep it."""
     board.session.call(protocol.UpdateConfirmRequest())
 
 
-def update(
-    board: Board, package: Package, progress: Progress | None = None, keep: bool = True, wait_s: float = 10.0
-) -> Updated:
-    """Bring another firmware onto a dark board, restart it, and keep it once it answers.
+def update_firmware(
+    board: Board,
+    package: UpdatePackage,
+    progress: Progress | None = None,
+    keep: bool = True,
+    wait_s: float = 10.0,
+) -> UpdateResult:
+    """Write another firmware to a dark board, restart it, and keep the firmware once it answers.
 
-    Until it is kept it runs on trial: at the third reset the board goes back to the one before. A failure at
-    any moment leaves that one.
+    Until then it is on trial: at the third reset the board goes back to the previous one, which any failure
+    leaves intact.
 
     Args:
         board: The board; its session is opened anew.
         package: The firmware.
         progress: Called with bytes done and bytes in all.
         keep: Whether to end the trial.
-        wait_s: How long the restart may take, s.
+        wait_s: Longest time for the restart, s.
 
     Raises:
         IncompatibleError: The firmware is for another board.
@@ -170,7 +174,7 @@ def update(
         raise type(fault)(
             f"{fault}; it begins anew, and the board keeps the firmware that it runs"
         ) from fault
-    _restart(board, wait_s)
+    _restart_board(board, wait_s)
     after = update_status(board)
     if after.running != before.next:
         raise VerifyError(
@@ -178,24 +182,24 @@ def update(
             " start; the board went back"
         )
     if keep:
-        confirm(board)
-    return Updated(after.running, len(data), sequence, about_table(board.about)["firmware"])
+        confirm_update(board)
+    return UpdateResult(after.running, len(data), sequence, info_table(board.info)["firmware"])
 
 
-def _restart(board: Board, wait_s: float) -> None:
-    """Restart the board, and say HELLO until it answers; one that has been reset has taken fewer requests."""
+def _restart_board(board: Board, wait_s: float) -> None:
+    """Restart the board, and send HELLO until it answers with its count of requests reset."""
     session, line = board.session, board.session.transport
-    taken = board.status().requests
+    requests = board.status().requests
     session.call(protocol.UpdateRestartRequest())
     begin = line.time_s()
-    # a slow one gets longer
+    # a slow board gets longer
     end = begin + wait_s + 20 * session.client.latency_s
     while line.time_s() < begin + 0.1:  # the answer is out, and the reset under way
         line.read(0.02)
     while True:
         try:
-            board.about = session.hello()
-            if board.status().requests < taken:
+            board.info = session.hello()
+            if board.status().requests < requests:
                 return
         except BoardError:
             if line.time_s() > end:

@@ -1,4 +1,4 @@
-"""`evlcp board build`, `flash` and `update`: the firmware as files, into a part, and over a board's line."""
+"""`evlcp board build`, `flash` and `update`: the firmware as files, in a part, and over a board's line."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 import typer
 
 from evlcp_sdk.cli._common import progress_bar
-from firmware_host.commands._json import AsJson, say
+from firmware_host.commands._json import AsJson, print_result
 from firmware_host.commands._line import BoardLine, LineCommand, from_command_line, open_board
 
 Target = Literal["stm32f405-8mhz", "stm32f405-12mhz"]
-"""Boards that an image is built for."""
+"""Boards with an image, by part and crystal."""
 
 
 class FlashCommand(LineCommand):
@@ -29,14 +29,14 @@ def build_images(
     For example: [bold]evlcp board build --target stm32f405-8mhz -o build[/]
     """
     from evlcp_sdk.files import Outputs, writing
-    from firmware_host.board.update import Package
+    from firmware_host.board.update import UpdatePackage
     from firmware_host.build import TARGETS, arm_image
     from firmware_host.images import FlashImage
 
     elf = arm_image(TARGETS[target])
     image = FlashImage.read(elf)
     contents = {suffix: elf.with_suffix(suffix).read_bytes() for suffix in (".elf", ".hex", ".bin")}
-    contents[".update.json"] = Package.built(target).to_json().encode()
+    contents[".update.json"] = UpdatePackage.build(target).to_json().encode()
     paths = [output / f"{target}{suffix}" for suffix in contents]
     with writing(output):
         output.mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,7 @@ def build_images(
         "bytes": len(image.data),
         "files": [str(path) for path in paths],
     }
-    say(
+    print_result(
         f"{paths[0]}, .hex, .bin, .update.json: {len(image.data)} bytes at {image.address:#x}", table, as_json
     )
 
@@ -111,7 +111,7 @@ def flash(
     words.append("BOOT0 low and reset starts it")
     if table["brown_out"] is False:
         words.append("brown-out reset is off: flash with --brown-out, or LEDs may stay lit below 2.7 V")
-    say("; ".join(words), table, as_json)
+    print_result("; ".join(words), table, as_json)
 
 
 def update(
@@ -132,23 +132,23 @@ def update(
     For example: [bold]evlcp board update stm32f405-8mhz.update.json --port /dev/ttyUSB0[/]
     """
     from evlcp_sdk.errors import ConfigError
-    from firmware_host.board import update as field
+    from firmware_host.board import update as updates
 
     if (file is not None) + (target is not None) + confirm != 1:
         raise ConfigError("give an update, --target to build one, or --confirm, one of the three")
     package = None
     if file is not None:
-        package = field.Package.read(file)
+        package = updates.UpdatePackage.read(file)
     elif target is not None:
-        package = field.Package.built(target)
+        package = updates.UpdatePackage.build(target)
     with open_board(context) as board:
         if package is None:
-            running = field.update_status(board).running
-            field.confirm(board)
-            say(f"image {running} is kept", {"image": running, "kept": True}, as_json)
+            running = updates.update_status(board).running
+            updates.confirm_update(board)
+            print_result(f"image {running} is kept", {"image": running, "kept": True}, as_json)
             return
         with progress_bar("updating") as progress:
-            done = field.update(board, package, progress, keep)
+            done = updates.update_firmware(board, package, progress, keep)
     words = f"image {done.image} runs, {done.length} bytes, firmware {done.firmware}"
     table = {"image": done.image, "bytes": done.length, "sequence": done.sequence, "firmware": done.firmware}
-    say(words + ("" if keep else ", on trial"), table | {"kept": keep}, as_json)
+    print_result(words + ("" if keep else ", on trial"), table | {"kept": keep}, as_json)

@@ -1,4 +1,4 @@
-"""Commands with `--json`: what goes wrong is JSON on stdout, too, beside the line on stderr."""
+"""Commands with `--json`: errors are JSON on stdout, besides the line on stderr."""
 
 from typing import Annotated, Any
 
@@ -10,8 +10,8 @@ from evlcp_sdk.cli._common import echo, print_json
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, faults too.")]
 
 
-def say(text: str, table: dict[str, Any], as_json: bool) -> None:
-    """What a command has done: a line for a person, or JSON."""
+def print_result(text: str, table: dict[str, Any], as_json: bool) -> None:
+    """Print a command's result: a line of text, if there is any, or JSON."""
     if as_json:
         print_json(table)
     elif text:
@@ -19,7 +19,7 @@ def say(text: str, table: dict[str, Any], as_json: bool) -> None:
 
 
 def fault_table(fault: BaseException) -> dict[str, Any]:
-    """What went wrong, as plain values: kind, exit code, message."""
+    """An error as plain values: kind, exit code, message."""
     from evlcp_sdk.errors import explain_fault
 
     message, code = explain_fault(fault)
@@ -27,21 +27,21 @@ def fault_table(fault: BaseException) -> dict[str, Any]:
 
 
 class JsonCommand(TyperCommand):
-    """A command that prints `{"error": ...}` on stdout where it fails and was asked for JSON."""
+    """A command that prints `{"error": ...}` on stdout if it fails with `--json`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
-        """Parse; a fault of usage is JSON, too."""
+        """Parse; print an error of usage as JSON."""
         wanted = "--json" in args
         try:
             return super().parse_args(ctx, args)
         except Exception as fault:
             if wanted and hasattr(fault, "format_message"):
-                said = fault.format_message()
-                print_json({"error": {"kind": "UsageError", "exit_code": 2, "message": said}})
+                message = fault.format_message()
+                print_json({"error": {"kind": "UsageError", "exit_code": 2, "message": message}})
             raise
 
     def invoke(self, ctx: Any) -> Any:
-        """Run; a fault is JSON, too, unless stdout itself failed."""
+        """Run; print an error as JSON unless stdout itself failed."""
         try:
             return super().invoke(ctx)
         except (typer.Exit, typer.Abort):

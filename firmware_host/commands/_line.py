@@ -1,4 +1,4 @@
-"""A board on a line: the options that say which, once for all commands, and how commands open it."""
+"""The board of a command: the options that select it, and how commands open it."""
 
 import contextlib
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BoardLine:
-    """Where the board is."""
+    """The line to the board."""
 
     PANEL: ClassVar[str] = "Line"
 
@@ -48,15 +48,15 @@ class BoardLine:
         ),
     ] = None
 
-    def found(self) -> str:
-        """The port: the one that is named, or the one of those that are asked that has a board."""
-        from firmware_host.board.survey import find
+    def find_port(self) -> str:
+        """The named port, or else the only one on which a board answers."""
+        from firmware_host.board.survey import find_board_port
 
-        return self.port or find(self.baud)
+        return self.port or find_board_port(self.baud)
 
     @contextlib.contextmanager
     def open(self) -> "Iterator[Board]":
-        """The board on the line, or the recorded one."""
+        """Open the board on the line, or the recorded one."""
         from evlcp_sdk.errors import ConfigError
         from firmware_host.board.board import Board
         from firmware_host.board.keys import read_board_key
@@ -65,16 +65,16 @@ class BoardLine:
         from firmware_host.ports.transport import ReplayTransport
         from firmware_host.protocol.client import Timing
 
-        # before the line is opened
+        # an invalid key is reported before the line is opened
         key = None if self.key is None else read_board_key(self.key)
         if self.replay is None:
-            line = open_port(self.found(), self.baud)
+            line = open_port(self.find_port(), self.baud)
             session = Session(line, Timing(self.baud), key=key, trace=self.trace)
         elif self.trace is not None:
             raise ConfigError("--trace and --replay: give one of the two")
         else:
-            played = ReplayTransport(self.replay)
-            session = Session(played, Timing(played.baud), played.first, played.nonce, key=key)
+            trace = ReplayTransport(self.replay)
+            session = Session(trace, Timing(trace.baud), trace.first, trace.nonce, key=key)
         with session:
             yield Board(session)
 
@@ -87,15 +87,15 @@ LINE = tuple(field.name for field in fields(BoardLine))
 def line_options(*, context: typer.Context, line: BoardLine) -> None:
     """The callback of a group whose commands work on a board."""
     name = context.invoked_subcommand or ""
-    taken = getattr(getattr(context.command, "commands", {}).get(name), "line", ())
+    allowed = getattr(getattr(context.command, "commands", {}).get(name), "line", ())
     for option in LINE:
-        if option not in taken and from_command_line(context, option):
+        if option not in allowed and from_command_line(context, option):
             raise typer.BadParameter(f"'{name}' takes no --{option}", param_hint=f"--{option}")
     context.obj = line
 
 
 class LineCommand(JsonCommand):
-    """A command on a board: the group's options of the line may stand behind its name, too."""
+    """A command on a board: the group's options of the line may follow its name, too."""
 
     line: ClassVar[tuple[str, ...]] = LINE
 
@@ -105,34 +105,34 @@ class LineCommand(JsonCommand):
         return [*super().get_params(ctx), *(p for p in group if p.name in self.line)]
 
     def invoke(self, ctx: Any) -> Any:
-        """Run it; what stands behind its name counts more than what stands before."""
+        """Run it; options after its name override those before it."""
         given = {name: ctx.params.pop(name) for name in self.line}
-        here = {name: value for name, value in given.items() if from_command_line(ctx, name)}
-        ctx.obj = replace(ctx.obj or BoardLine(), **here)
+        after_name = {name: value for name, value in given.items() if from_command_line(ctx, name)}
+        ctx.obj = replace(ctx.obj or BoardLine(), **after_name)
         return super().invoke(ctx)
 
 
 class SurveyCommand(LineCommand):
-    """A command that asks all ports."""
+    """A command on all ports."""
 
     line = ("baud",)
 
 
 def from_command_line(context: Any, name: str) -> bool:
-    """Whether a parameter was given as an option or argument."""
+    """Whether a parameter comes from the command line, not from its default or the environment."""
     return getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE"
 
 
 @contextlib.contextmanager
 def open_board(context: typer.Context) -> "Iterator[Board]":
-    """The board that a command's options name."""
+    """Open the board that a command's options select."""
     line: BoardLine = context.obj
     with line.open() as board:
         yield board
 
 
-def say_watchdog(action: str, timeout_ms: int) -> None:
-    """Say what happens once this command has ended, unless the board goes on playing."""
+def print_watchdog(action: str, timeout_ms: int) -> None:
+    """Print what the board's watchdog will do after this command, unless it keeps playing."""
     if action != "keep":
         what = "shows its idle pattern" if action == "idle" else "goes dark"
         echo(
@@ -148,24 +148,24 @@ KeepAlive = Annotated[
 
 
 def keep_alive(board: "Board") -> None:
-    """Stay with a board until Ctrl-C; a line on stderr where its state or its faults change."""
+    """Keep a board's watchdog from acting until Ctrl-C; print changes of state and faults on stderr."""
     from evlcp_sdk.cli._complain import complain
-    from firmware_host.board.tables import name_of, names_of_bits
+    from firmware_host.board.tables import enum_name, flag_names
     from firmware_host.protocol.generated.requests import BoardFault, State
 
     status = board.status()
     with contextlib.suppress(KeyboardInterrupt):
         while True:
             before = (status.state, status.faults)
-            board.stay(1.0, status)
+            board.wait_with_keep_alive(1.0, status)
             status = board.status()
             if (status.state, status.faults) != before:
-                faults = ", ".join(names_of_bits(BoardFault, status.faults)) or "none"
-                complain(f"{board.session.name}: state {name_of(State, status.state)}, faults {faults}")
+                faults = ", ".join(flag_names(BoardFault, status.faults)) or "none"
+                complain(f"{board.session.name}: state {enum_name(State, status.state)}, faults {faults}")
 
 
-def say_done(done: Any, as_json: bool) -> None:
-    """Say what programming did."""
+def print_program_result(done: Any, as_json: bool) -> None:
+    """Print the result of programming."""
     if as_json:
         import dataclasses
 
@@ -175,4 +175,4 @@ def say_done(done: Any, as_json: bool) -> None:
     else:
         echo(f"sent {done.written} of {done.length} bytes; bank {done.bank} is active")
     if not as_json:
-        say_watchdog(done.watchdog, done.watchdog_ms)
+        print_watchdog(done.watchdog, done.watchdog_ms)

@@ -1,4 +1,4 @@
-"""Where a command's symbols and their link come from: a file, or random ones with a seed."""
+"""Options for a command's symbols and their link: a file, or random symbols with a seed."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SymbolOptions:
-    """Symbols, and the link that they are sent with."""
+    """Symbols and their link."""
 
     symbols: Annotated[
         Path | None,
@@ -32,8 +32,8 @@ class SymbolOptions:
     link_file: LinkFile = None
     overrides: Overrides = None
 
-    def given_link(self) -> "Link | None":
-        """The link that -c and --set name; None if neither is given."""
+    def load_given_link(self) -> "Link | None":
+        """Load the link of -c and --set; None if neither is given."""
         from evlcp_sdk.link.resolve import load_link
 
         if self.link_file is None and not self.overrides:
@@ -41,10 +41,10 @@ class SymbolOptions:
         return load_link(self.link_file, self.overrides or [])
 
     def load(self) -> "tuple[NDArray[np.int64], Link]":
-        """Symbols (packets, frames, clusters) of the file, or random ones, and the link they are sent with.
+        """Load symbols (packets, frames, clusters) from the file, or draw random ones; with their link.
 
         Raises:
-            ConfigError: Neither is given, or both, or the link is wrong.
+            ConfigError: Neither or both are given, or the link is wrong.
             IncompatibleError: The file was made with another link.
             InputError: The file is wrong.
         """
@@ -52,7 +52,7 @@ class SymbolOptions:
         from firmware_host.board.bank import random_packets
         from firmware_host.board.symbols import read_symbols
 
-        link = self.given_link()
+        link = self.load_given_link()
         if self.symbols is not None and self.random is None:
             return read_symbols(self.symbols, link)
         if self.random is None or self.symbols is not None:
@@ -63,26 +63,26 @@ class SymbolOptions:
 
 @dataclass(frozen=True)
 class BankOptions(SymbolOptions):
-    """What a board is to play: symbols, or chips."""
+    """A board's payload: symbols, or chips."""
 
     masks: Annotated[
         Path | None,
         typer.Option(metavar="FILE.npy", help="Chips instead of symbols."),
     ] = None
 
-    def bank(self) -> "Bank":
-        """The content of a bank.
+    def load_bank(self) -> "Bank":
+        """Load the bank.
 
         Raises:
-            ConfigError: Not one of them is given, the link is wrong, or a board cannot play it.
+            ConfigError: Not exactly one of them is given, the link is wrong, or a board cannot play it.
             IncompatibleError: The file was made with another link.
             InputError: A file is wrong.
         """
         from evlcp_sdk.link.resolve import load_link
-        from firmware_host.board.bank import bank_of, read_masks
+        from firmware_host.board.bank import make_bank, read_masks
 
         if self.masks is None:
-            return bank_of(*self.load())
+            return make_bank(*self.load())
         if self.symbols is not None or self.random is not None:
             raise ConfigError("--masks, --random and SYMBOLS.json: give one of them")
-        return read_masks(self.masks, self.given_link() or load_link())
+        return read_masks(self.masks, self.load_given_link() or load_link())

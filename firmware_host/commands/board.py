@@ -12,7 +12,7 @@ import typer
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, echo, print_json, progress_bar
 from firmware_host.commands import _firmware
-from firmware_host.commands._json import AsJson, JsonCommand, fault_table, say
+from firmware_host.commands._json import AsJson, JsonCommand, fault_table, print_result
 from firmware_host.commands._line import (
     LINE,
     BoardLine,
@@ -23,8 +23,8 @@ from firmware_host.commands._line import (
     keep_alive,
     line_options,
     open_board,
-    say_done,
-    say_watchdog,
+    print_program_result,
+    print_watchdog,
 )
 from firmware_host.commands._source import BankOptions
 from firmware_host.commands.stream import stream
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from firmware_host.board.bank import Bank
     from firmware_host.board.board import Board
     from firmware_host.board.fleet import Entry
-    from firmware_host.board.monitor import Back, Gone, KeyMissing
+    from firmware_host.board.monitor import BoardGone, BoardReturned, KeyMissing
     from firmware_host.protocol.generated.requests import StatusReply
 
 app = typer.Typer(
@@ -62,7 +62,7 @@ Silence = Literal["keep", "idle", "dark"]
 """What a board does when the host falls silent."""
 
 
-def _show(table: dict[str, Any], as_json: bool) -> None:
+def _print_table(table: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print_json(table)
         return
@@ -89,31 +89,31 @@ def ports(
 
     For example: [bold]evlcp board ports --usb 0403[/]
     """
-    from firmware_host.board.survey import Found, survey
-    from firmware_host.board.tables import about_table
+    from firmware_host.board.survey import SurveyedPort, survey_ports
+    from firmware_host.board.tables import info_table
     from firmware_host.ports.usb import UsbFilter, serial_ports
 
     line: BoardLine = context.obj
     wanted = None if usb is None else UsbFilter.parse(usb)
     if ask:
-        found = survey(line.baud, None, wanted, every)
+        found = survey_ports(line.baud, None, wanted, every)
     else:
         listed = [p for p in serial_ports() if wanted is None or wanted.matches(p)]
-        found = [Found(p, False, None, "not asked") for p in listed]
+        found = [SurveyedPort(p, False, None, "not asked") for p in listed]
     if as_json:
         rows = []
         for f in found:
             port = asdict(f.port)
-            about = about_table(f.about) if f.about else None
-            said = {"asked": f.asked, "board": about, "fault": f.fault or None}
-            rows.append({"port": port.pop("device"), **port, **said})
+            info = info_table(f.info) if f.info else None
+            answer = {"asked": f.asked, "board": info, "fault": f.fault or None}
+            rows.append({"port": port.pop("device"), **port, **answer})
         print_json(rows)
         return
     for f in found:
         what = f.fault
-        if f.about:
-            about = about_table(f.about)
-            what = f"{about['hal']} {about['unique_id']}, firmware {about['firmware']}"
+        if f.info:
+            info = info_table(f.info)
+            what = f"{info['hal']} {info['unique_id']}, firmware {info['firmware']}"
         serial = f" {f.port.serial_number}" if f.port.serial_number else ""
         echo(f"{f.port.device}  {f.port.usb or '-'}{serial}  {f.port.description}  {what}")
     if not found:
@@ -130,10 +130,10 @@ def hello(
 
     For example: [bold]evlcp board --port native: hello[/]
     """
-    from firmware_host.board.tables import about_table
+    from firmware_host.board.tables import info_table
 
     with open_board(context) as board:
-        _show(about_table(board.about), as_json)
+        _print_table(info_table(board.info), as_json)
 
 
 @app.command(cls=LineCommand)
@@ -170,11 +170,11 @@ def program(
     A text:   [bold]evlcp tx message --text "Tempo 30" --port /dev/ttyUSB0[/]
     """
     if inventory is not None:
-        _beside_inventory(context, "verify", "stay")
+        _check_inventory_options(context, "verify", "stay")
         from firmware_host.board.fleet import program_fleet, read_inventory
 
         boards = read_inventory(inventory)
-        program_fleet(boards, verify, _report(as_json))
+        program_fleet(boards, verify, _make_reporter(as_json))
         if stay:
             _watch_fleet(inventory, boards.entries, 1.0, None, True, as_json, quiet=True)
         return
@@ -182,18 +182,18 @@ def program(
     from firmware_host.protocol.generated.requests import Watchdog
 
     action = None if watchdog is None else Watchdog[watchdog.upper()]
-    bank = payload.bank()
+    bank = payload.load_bank()
     settings = Settings(level, action, watchdog_ms, start, level_limit, duty_limit)
     with open_board(context) as board:
         with progress_bar("programming") as progress:
             done = provision(board, bank, settings, verify, progress)
-        say_done(done, as_json)
+        print_program_result(done, as_json)
         if stay:
             keep_alive(board)
 
 
-def _beside_inventory(context: typer.Context, *allowed: str) -> None:
-    """Raise ConfigError if an option was given that stands in the inventory."""
+def _check_inventory_options(context: typer.Context, *allowed: str) -> None:
+    """Raise ConfigError if an option is given that belongs into the inventory."""
     from evlcp_sdk.errors import ConfigError
 
     given = [
@@ -211,31 +211,31 @@ def _beside_inventory(context: typer.Context, *allowed: str) -> None:
         )
 
 
-def _report(as_json: bool) -> Callable[[str, dict[str, Any]], None]:
-    """Prints how each board of an inventory ended."""
-    return lambda said, table: say(said, table, as_json)
+def _make_reporter(as_json: bool) -> Callable[[str, dict[str, Any]], None]:
+    """A function that prints the result of each board of an inventory."""
+    return lambda text, table: print_result(text, table, as_json)
 
 
-def _each(
+def _run_on_boards(
     context: typer.Context,
     inventory: Path | None,
     as_json: bool,
     work: Callable[[Entry | None, Board], tuple[str, dict[str, Any]]],
     *allowed: str,
 ) -> None:
-    """Do something with a board, or with all of an inventory, and say what.
+    """Work on a board, or on all of an inventory, and print the results.
 
-    With an inventory it ends with the exit code of the first that fails, and `allowed` options may be given.
+    With an inventory, `allowed` options may be given, and the exit code is that of the first failed board.
     """
     if inventory is None:
         with open_board(context) as board:
-            said, table = work(None, board)
-        say(said, table, as_json)
+            text, table = work(None, board)
+        print_result(text, table, as_json)
         return
     from firmware_host.board.fleet import read_entries, run_fleet
 
-    _beside_inventory(context, *allowed)
-    run_fleet(inventory, read_entries(inventory), work, _report(as_json))
+    _check_inventory_options(context, *allowed)
+    run_fleet(inventory, read_entries(inventory), work, _make_reporter(as_json))
 
 
 @app.command(cls=LineCommand)
@@ -254,7 +254,7 @@ def send(
     from firmware_host.errors import RefusedError
     from firmware_host.protocol.generated.requests import NO_BANK, Status
 
-    bank = payload.bank()
+    bank = payload.load_bank()
     with open_board(context) as board, progress_bar("sending") as progress:
         status = board.status()
         if status.active_bank == NO_BANK:
@@ -264,7 +264,7 @@ def send(
             )
         board.check_same_air(bank, status)
         done = board.program(bank, verify, progress)
-    say_done(done, as_json)
+    print_program_result(done, as_json)
 
 
 app.command(cls=LineCommand)(stream)
@@ -306,7 +306,7 @@ def start(
         return
     if timeout is not None:
         raise ConfigError("--timeout belongs to --pulse-hz: without it a board plays at once")
-    _simple(context, inventory, as_json, lambda board: board.start(), "playing")
+    _change_state(context, inventory, as_json, lambda board: board.start(), "playing")
 
 
 @app.command(cls=LineCommand)
@@ -317,54 +317,54 @@ def stop(context: typer.Context, inventory: InventoryFile = None, as_json: AsJso
         board.stop()
         board.wait_dark()
 
-    _simple(context, inventory, as_json, work, "dark")
+    _change_state(context, inventory, as_json, work, "dark")
 
 
 @app.command(cls=LineCommand)
 def blank(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
     """Dark at once."""
-    _simple(context, inventory, as_json, lambda board: board.blank(), "dark")
+    _change_state(context, inventory, as_json, lambda board: board.blank(), "dark")
 
 
 def _start_together(
     context: typer.Context, inventory: Path | None, pulse_hz: int, timeout_s: float | None, as_json: bool
 ) -> None:
-    """One board, or all of an inventory, at the same pulse."""
-    from firmware_host.board.fleet import board_of, read_entries
+    """Start one board, or all of an inventory, at the same pulse."""
+    from firmware_host.board.fleet import open_entry, read_entries
     from firmware_host.board.step import start_together, wait_for_pulse
 
     with contextlib.ExitStack() as stack:
         if inventory is None:
             boards = [stack.enter_context(open_board(context))]
         else:
-            _beside_inventory(context, "pulse_hz", "timeout")
-            opened = (board_of(entry, inventory.parent) for entry in read_entries(inventory))
-            boards = [stack.enter_context(one) for one in opened]
+            _check_inventory_options(context, "pulse_hz", "timeout")
+            entries = read_entries(inventory)
+            boards = [stack.enter_context(open_entry(entry, inventory.parent)) for entry in entries]
         targets = start_together(boards, pulse_hz)
         table = {board.session.name: target for board, target in zip(boards, targets, strict=True)}
         words = ", ".join(f"{name} for its pulse {target}" for name, target in table.items())
         if timeout_s is None:
-            said = (
+            text = (
                 f"armed: waits for a pulse on PPS ({words}); 'evlcp board status' shows whether it has come"
             )
-            say(said, {"state": "waiting", "at_pulse": table}, as_json)
+            print_result(text, {"state": "waiting", "at_pulse": table}, as_json)
             return
         if not as_json:
             echo(f"armed: waits for a pulse on PPS ({words}), for at most {timeout_s:g} s")
         wait_for_pulse(boards, timeout_s)
-    say("plays", {"state": "playing", "at_pulse": table}, as_json)
+    print_result("plays", {"state": "playing", "at_pulse": table}, as_json)
 
 
-def _simple(
+def _change_state(
     context: typer.Context, inventory: Path | None, as_json: bool, ask: Callable[[Board], Any], state: str
 ) -> None:
-    """A request or two, after which a board, or all of an inventory, is in a state."""
+    """Bring a board, or all of an inventory, to a state by a request."""
 
     def work(_: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
         ask(board)
         return state if inventory else "", {"state": state}
 
-    _each(context, inventory, as_json, work)
+    _run_on_boards(context, inventory, as_json, work)
 
 
 @app.command(cls=LineCommand)
@@ -378,8 +378,8 @@ def level(
     For example: [bold]evlcp board --port /dev/ttyUSB0 level 20[/]
     """
     with open_board(context) as board:
-        board.level(level_ma)
-    say("", {"level_ma": level_ma}, as_json)
+        board.set_level(level_ma)
+    print_result("", {"level_ma": level_ma}, as_json)
 
 
 @app.command(cls=LineCommand)
@@ -393,11 +393,11 @@ def watchdog(
     from firmware_host.protocol.generated.requests import Watchdog
 
     with open_board(context) as board:
-        board.watchdog(Watchdog[action.upper()], after_ms)
+        board.set_watchdog(Watchdog[action.upper()], after_ms)
     if as_json:
         print_json({"watchdog": action, "watchdog_ms": after_ms})
     else:
-        say_watchdog(action, after_ms)
+        print_watchdog(action, after_ms)
 
 
 @app.command(cls=LineCommand)
@@ -411,7 +411,7 @@ def status(
 
     if inventory is None:
         with open_board(context) as board:
-            _show(status_table(board.status()), as_json)
+            _print_table(status_table(board.status()), as_json)
         return
 
     def work(_: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
@@ -419,7 +419,7 @@ def status(
         faults = f", faults {', '.join(found['faults'])}" if found["faults"] else ""
         return f"{found['state']}, {found['packets_sent']} packets sent{faults}", {"status": found}
 
-    _each(context, inventory, as_json, work)
+    _run_on_boards(context, inventory, as_json, work)
 
 
 @app.command(cls=LineCommand)
@@ -438,17 +438,17 @@ def monitor(
     if inventory is not None:
         from firmware_host.board.fleet import read_entries
 
-        _beside_inventory(context, "interval", "count", "reconnect")
+        _check_inventory_options(context, "interval", "count", "reconnect")
         _watch_fleet(inventory, read_entries(inventory), interval, count, reconnect, as_json)
         return
-    from firmware_host.board.monitor import watch
+    from firmware_host.board.monitor import watch_board
 
     line: BoardLine = context.obj
-    # Where no port is named the one that is found now is meant, whatever comes later.
-    named = line if line.port or line.replay else replace(line, port=line.found())
+    # Without a named port, the one that is found now is kept.
+    named = line if line.port or line.replay else replace(line, port=line.find_port())
     with contextlib.suppress(KeyboardInterrupt):
-        for seen in watch(named.open, interval, count, reconnect):
-            _print_seen(seen, {"port": named.port}, as_json)
+        for event in watch_board(named.open, interval, count, reconnect):
+            _print_event(event, {"port": named.port}, as_json)
 
 
 def _watch_fleet(
@@ -460,68 +460,70 @@ def _watch_fleet(
     as_json: bool,
     quiet: bool = False,
 ) -> None:
-    """Watch all boards of an inventory until Ctrl-C, or until each has been seen `count` times.
+    """Watch all boards of an inventory until Ctrl-C, or until each has had `count` statuses.
 
-    `quiet` prints only boards that go and come.
+    `quiet` prints only lost and returned boards.
     """
     import threading
     from concurrent.futures import ThreadPoolExecutor
     from functools import partial
 
-    from firmware_host.board.fleet import board_of
-    from firmware_host.board.monitor import watch
+    from firmware_host.board.fleet import open_entry
+    from firmware_host.board.monitor import watch_board
     from firmware_host.protocol.generated.requests import StatusReply
 
     ended, printing = threading.Event(), threading.Lock()
 
-    def one(entry: Entry) -> None:
-        for seen in watch(
-            partial(board_of, entry, path.parent), interval, count, reconnect, reconnect, ended
+    def watch_entry(entry: Entry) -> None:
+        for event in watch_board(
+            partial(open_entry, entry, path.parent), interval, count, reconnect, reconnect, ended
         ):
-            if quiet and isinstance(seen, StatusReply):
+            if quiet and isinstance(event, StatusReply):
                 continue
             with printing:
-                _print_seen(seen, {"id": entry.id, "port": entry.port}, as_json)
+                _print_event(event, {"id": entry.id, "port": entry.port}, as_json)
 
     with ThreadPoolExecutor(len(entries)) as pool:
-        looks = [pool.submit(one, entry) for entry in entries]
+        watches = [pool.submit(watch_entry, entry) for entry in entries]
         try:
-            for look in looks:
-                look.result()
+            for watch in watches:
+                watch.result()
         except KeyboardInterrupt:
             return
         finally:
             ended.set()
 
 
-def _print_seen(seen: StatusReply | Gone | Back | KeyMissing, which: dict[str, Any], as_json: bool) -> None:
-    """A line of `monitor`: of a board that is there on stdout, of one that goes and comes on stderr."""
+def _print_event(
+    event: StatusReply | BoardGone | BoardReturned | KeyMissing, which: dict[str, Any], as_json: bool
+) -> None:
+    """Print a line of `monitor`: a status on stdout, other events on stderr."""
     from evlcp_sdk.cli._complain import complain
-    from firmware_host.board.monitor import Back, Gone, KeyMissing
-    from firmware_host.board.tables import name_of, status_table
+    from firmware_host.board.monitor import BoardGone, BoardReturned, KeyMissing
+    from firmware_host.board.tables import enum_name, status_table
     from firmware_host.protocol.generated.requests import State
 
     name = which.get("id") or which["port"]
-    if isinstance(seen, Gone):
+    if isinstance(event, BoardGone):
         if as_json:
-            print_json(which | fault_table(seen.fault))
-        complain(f"{seen.fault}; it is looked for, end with Ctrl-C")
-    elif isinstance(seen, Back):
+            print_json(which | fault_table(event.fault))
+        complain(f"{event.fault}; it is looked for, end with Ctrl-C")
+    elif isinstance(event, BoardReturned):
         if as_json:
-            print_json(which | {"back_after_s": round(seen.after_s, 3)})
-        complain(f"{name}: answers again after {seen.after_s:.1f} s")
-    elif isinstance(seen, KeyMissing):
+            print_json(which | {"back_after_s": round(event.after_s, 3)})
+        complain(f"{name}: answers again after {event.after_s:.1f} s")
+    elif isinstance(event, KeyMissing):
         complain(f"{name}: has a key: without it (--key) this host does not keep its watchdog from acting")
     elif as_json:
-        print_json(which | status_table(seen))
+        print_json(which | status_table(event))
     else:
         head = f"{name}  " if "id" in which else ""
         echo(
-            f"{head}{seen.uptime_ms / 1e3:10.1f} s  {name_of(State, seen.state):12}"
-            f" packets {seen.packets_sent:8}"
-            f"  late {seen.lateness_ticks:5} (max {seen.lateness_max_ticks}) ticks"
-            f"  errors crc {seen.crc_errors} framing {seen.framing_errors} overflow {seen.overflow_errors}"
-            f"  faults {seen.faults:#04x}"
+            f"{head}{event.uptime_ms / 1e3:10.1f} s  {enum_name(State, event.state):12}"
+            f" packets {event.packets_sent:8}"
+            f"  late {event.lateness_ticks:5} (max {event.lateness_max_ticks}) ticks"
+            f"  errors crc {event.crc_errors} framing {event.framing_errors} overflow {event.overflow_errors}"
+            f"  faults {event.faults:#04x}"
         )
 
 
@@ -539,11 +541,11 @@ def verify(
     For example: [bold]evlcp board --port /dev/ttyUSB0 verify SYMBOLS.json[/]
     """
     if inventory is None:
-        banks: Mapping[str, Bank] = {"": payload.bank()}
+        banks: Mapping[str, Bank] = {"": payload.load_bank()}
     else:
         from firmware_host.board.fleet import read_inventory
 
-        _beside_inventory(context)
+        _check_inventory_options(context)
         banks = read_inventory(inventory).banks
 
     def compare(entry: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
@@ -552,7 +554,7 @@ def verify(
         table = {"bytes": len(bank.content), "bank": number, "crc": f"{bank.crc:08x}"}
         return f"same: {len(bank.content)} bytes in bank {number}, CRC {bank.crc:08x}", table
 
-    _each(context, inventory, as_json, compare)
+    _run_on_boards(context, inventory, as_json, compare)
 
 
 @app.command("test-leds", cls=LineCommand)
@@ -572,7 +574,7 @@ def walk_leds(
         board.test_leds(first, last, dwell_ms)
         if wait:
             board.wait_dark(10.0 + (last - first + 1) * dwell_ms * 2e-3)
-    say("", {"first": first, "last": last, "dwell_ms": dwell_ms}, as_json)
+    print_result("", {"first": first, "last": last, "dwell_ms": dwell_ms}, as_json)
 
 
 @app.command(cls=LineCommand)
@@ -592,7 +594,7 @@ def save(
         table = {"slot": reply.slot, "save_sequence": reply.save_sequence, "autostart": autostart}
         return f"saved in slot {reply.slot}, number {reply.save_sequence}", table
 
-    _each(context, inventory, as_json, work, "autostart")
+    _run_on_boards(context, inventory, as_json, work, "autostart")
 
 
 @app.command(cls=LineCommand)
@@ -601,7 +603,7 @@ def recall(context: typer.Context, as_json: AsJson = False) -> None:
     with open_board(context) as board:
         reply = board.recall()
     table = {"slot": reply.slot, "save_sequence": reply.save_sequence}
-    say(f"recalled slot {reply.slot}, number {reply.save_sequence}", table, as_json)
+    print_result(f"recalled slot {reply.slot}, number {reply.save_sequence}", table, as_json)
 
 
 @app.command()
@@ -663,7 +665,7 @@ def keygen(
     from firmware_host.protocol.seal import key_name
 
     name = key_name(read_board_key(file)).hex() if show else make_board_key(file)
-    say(name, {"key": name}, as_json)
+    print_result(name, {"key": name}, as_json)
 
 
 @app.command(cls=LineCommand)
@@ -686,8 +688,8 @@ def lock(
     key = read_board_key(file)
     with open_board(context) as board:
         board.set_key(key)
-        name = board.about.key_name.hex()
-    say(f"locked with key {name}; 'evlcp board save' keeps it over a reset", {"key": name}, as_json)
+        name = board.info.key_name.hex()
+    print_result(f"locked with key {name}; 'evlcp board save' keeps it over a reset", {"key": name}, as_json)
 
 
 @app.command(cls=LineCommand)
@@ -695,7 +697,7 @@ def unlock(context: typer.Context, as_json: AsJson = False) -> None:
     """Take a board's key away, until a reset unless it is saved."""
     with open_board(context) as board:
         board.set_key(None)
-    say("unlocked; 'evlcp board save' keeps it so over a reset", {"key": None}, as_json)
+    print_result("unlocked; 'evlcp board save' keeps it so over a reset", {"key": None}, as_json)
 
 
 @app.command(cls=JsonCommand)
@@ -733,7 +735,7 @@ def leds(
         outputs.write_array(table, chips)
         outputs.write_array(played.ticks, chips.with_suffix(".ticks.npy"))
         outputs.commit()
-    say(f"{len(played)} chips", {"chips": len(played), "cut_bytes": played.cut_bytes}, as_json)
+    print_result(f"{len(played)} chips", {"chips": len(played), "cut_bytes": played.cut_bytes}, as_json)
     if played.cut_bytes:
         raise InputError(
             f"{record}: the last record is cut off ({played.cut_bytes} bytes) and left out;"

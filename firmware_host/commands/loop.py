@@ -41,7 +41,7 @@ def loop(
     from evlcp_sdk.diagnosis.facts import Diagnostic
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
-    from firmware_host.loop import loop as steps
+    from firmware_host.loop import run_loop
 
     link = load_link(link_file, overrides or [], Registry.load())
     screen = console()
@@ -56,12 +56,14 @@ def loop(
         def advance(share: float) -> None:
             bar(share, 1.0)
 
-        for step in steps(text, link, out, distance_m=distance_m, seed=seed, sinks=sinks, advance=advance):
+        for step in run_loop(
+            text, link, out, distance_m=distance_m, seed=seed, sinks=sinks, progress=advance
+        ):
             files += step.files
             if as_json:
                 echo(json.dumps({"step": step.name, **step.figures, "files": list(step.files)}))
                 continue
-            screen.print(f"{step.name:9} {step.said}")
+            screen.print(f"{step.name:9} {step.summary}")
             for warning in step.figures.get("warnings", ()):
                 screen.print(f"          warning: {Diagnostic(**warning)}", style="yellow")
     if not as_json:

@@ -1,4 +1,4 @@
-"""`evlcp tx message` and `evlcp tx keygen`: messages to packets, chips and boards."""
+"""`evlcp tx message` and `evlcp tx keygen`: messages as packets and chips, and on boards."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import typer
 
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, progress_bar
-from firmware_host.commands._json import AsJson, say
-from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, say_done
-from firmware_host.commands.stream import Ahead, say_stream
+from firmware_host.commands._json import AsJson, print_result
+from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, print_program_result
+from firmware_host.commands.stream import Ahead, print_stream_result
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from evlcp_sdk.link.resolve import Link
-    from firmware_host.board.board import Board, Programmed
+    from firmware_host.board.board import Board, ProgramResult
     from firmware_host.board.messages import Content
 
 _MOST_NUMBER = 2**32 - 1
@@ -29,7 +29,7 @@ _MOST_NUMBER = 2**32 - 1
 
 @dataclass(frozen=True)
 class ContentOptions:
-    """What is sent."""
+    """The content of messages."""
 
     PANEL: ClassVar[str] = "What is sent"
 
@@ -64,11 +64,11 @@ class ContentOptions:
         ),
     ] = None
 
-    def content(self) -> Content:
-        """What to send, from now on.
+    def make(self) -> Content:
+        """The content, with times from now on.
 
         Raises:
-            ConfigError: Nothing, or what belongs to a beacon without one.
+            ConfigError: It is empty, or there are options of a beacon without one.
             InputError: The file cannot be read.
         """
         from time import time as clock_s
@@ -76,7 +76,7 @@ class ContentOptions:
         from evlcp_sdk.errors import ConfigError
         from evlcp_sdk.files import read_bytes
         from evlcp_sdk.link.compose import encode_utf8
-        from firmware_host.board.messages import Content, site_that_sends
+        from firmware_host.board.messages import Content, choose_site
 
         if not self.time and (self.text, self.file, self.beacon, self.countdown) == (None,) * 4:
             raise ConfigError(
@@ -87,7 +87,7 @@ class ContentOptions:
             raise ConfigError("--key and --user belong to a beacon: give --beacon site.toml, too")
         for option, given in (("--text", self.text), ("--user", self.user)):
             encode_utf8(given or "", option)
-        site = None if self.beacon is None else site_that_sends(self.beacon, self.transmitter_id, "--id")
+        site = None if self.beacon is None else choose_site(self.beacon, self.transmitter_id, "--id")
         fixed = {
             "data": None if self.file is None else read_bytes(self.file),
             "beacon": site,
@@ -108,7 +108,7 @@ class ContentOptions:
 
 @dataclass(frozen=True)
 class LineOptions:
-    """A board that plays it."""
+    """The board that plays the messages."""
 
     PANEL: ClassVar[str] = "Board"
 
@@ -130,14 +130,14 @@ class LineOptions:
     ] = None
 
     def line(self, *, only_named: bool = False) -> BoardLine | None:
-        """The line that is named, or else that of the environment; None for no board."""
+        """The line of the named port, or else that of the environment; None for no board."""
         port = self.port or (None if only_named else os.environ.get("EVLCP_PORT") or None)
         return None if port is None else BoardLine(port, self.baud, key=self.board_key)
 
 
 @dataclass(frozen=True)
-class AnewOptions:
-    """How often it is sent anew."""
+class PeriodOptions:
+    """Period of messages that change."""
 
     every: Annotated[
         float | None,
@@ -168,7 +168,7 @@ def message(
         typer.Option(metavar="FILE.npy", help="Write the chips: a row per chip."),
     ] = None,
     board: LineOptions,
-    anew: AnewOptions,
+    anew: PeriodOptions,
     stay: KeepAlive = False,
     link_file: LinkFile = None,
     overrides: Overrides = None,
@@ -187,38 +187,38 @@ def message(
     from firmware_host.board.symbols import symbols_table
 
     link = load_link(link_file, overrides or [], Registry.load())
-    made = content.content()
+    made = content.make()
     if anew.every is None and anew.count is not None:
         raise ConfigError("--count belongs to --every SECONDS")
     if anew.every is not None:
         if out is not None or chips is not None:
             raise ConfigError("--every sends what changes, to a board: -o and --chips hold what stays")
-        _send_anew(made, link, board.line(), repeat, anew, as_json=as_json)
+        _send_periodically(made, link, board.line(), repeat, anew, as_json=as_json)
         return
-    symbols, summary = _compose(made, link, repeat)
+    symbols, summary = _encode(made, link, repeat)
     table = symbols_table(symbols, link, messages=True)
-    _write(symbols, link, table, out, chips)
+    _write_files(symbols, link, table, out, chips)
     written = [str(path) for path in (out, chips) if path is not None]
     line = board.line(only_named=bool(written))
-    said = _describe(summary, written)
+    text = _describe(summary, written)
     if line is None:
-        say(said, summary | {"board": None} | table, as_json)
+        print_result(text, summary | {"board": None} | table, as_json)
         if not written and not as_json:
             raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
         return
     with line.open() as opened:
-        done = _program(opened, symbols, link)
-        say(f"{said}, again and again", summary | {"board": asdict(done)} | table, as_json)
+        done = _program_board(opened, symbols, link)
+        print_result(f"{text}, again and again", summary | {"board": asdict(done)} | table, as_json)
         if not as_json:
-            say_done(done, as_json)
+            print_program_result(done, as_json)
         if stay:
             keep_alive(opened)
 
 
-def _write(
+def _write_files(
     symbols: NDArray[np.int64], link: Link, table: dict[str, Any], out: Path | None, chips: Path | None
 ) -> None:
-    """Write the symbols' table and the chips, where that is asked for."""
+    """Write the symbols' table and the chips to the files that are given."""
     from evlcp_sdk.files import Outputs
     from firmware_host.board.bank import symbol_chips
 
@@ -230,51 +230,51 @@ def _write(
         outputs.commit()
 
 
-def _program(board: Board, symbols: NDArray[np.int64], link: Link) -> Programmed:
-    """Have a board send symbols again and again."""
-    from firmware_host.board.bank import bank_of
+def _program_board(board: Board, symbols: NDArray[np.int64], link: Link) -> ProgramResult:
+    """Program a board to send symbols repeatedly."""
+    from firmware_host.board.bank import make_bank
     from firmware_host.board.board import Settings, provision
 
     with progress_bar("programming") as progress:
-        return provision(board, bank_of(symbols, link), Settings(), True, progress)
+        return provision(board, make_bank(symbols, link), Settings(), True, progress)
 
 
-def _send_anew(
+def _send_periodically(
     content: Content,
     link: Link,
     line: BoardLine | None,
     repeat: int,
-    anew: AnewOptions,
+    anew: PeriodOptions,
     *,
     as_json: bool,
 ) -> None:
-    """Send content anew until it ends; say how that went."""
+    """Send content periodically until it ends; print the result."""
     from contextlib import suppress
 
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.signals import stop_on_request
-    from firmware_host.board.messages import check_interval, send_anew
+    from firmware_host.board.messages import check_interval, send_periodically
 
     assert anew.every is not None
     if line is None:
         raise ConfigError("--every sends to a board: give --port (or EVLCP_PORT)")
-    # What is wrong is known before the board waits for it.
+    # Errors are reported before the board waits.
     check_interval(content, link, repeat, anew.every)
     with line.open() as board:
         stream = board.stream(link, anew.ahead)
         with suppress(KeyboardInterrupt), stop_on_request() as stopped, stream:
-            send_anew(stream, content, link, repeat, anew.every, anew.count, stopped)
-    say_stream(stream, as_json)
+            send_periodically(stream, content, link, repeat, anew.every, anew.count, stopped)
+    print_stream_result(stream, as_json)
 
 
-def _compose(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int64], dict[str, Any]]:
-    """Symbols of the packets that say it now, and what they are."""
+def _encode(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int64], dict[str, Any]]:
+    """Symbols of the packets with the content now, and a summary of its messages."""
     from time import time as clock_s
 
     from evlcp_sdk.link.compose import encode_messages
     from firmware_host.board.messages import packet_s
 
-    messages = content.at(link, clock_s())
+    messages = content.messages_at(link, clock_s())
     symbols = encode_messages(messages, link.block_coder(), repeat)
     return symbols, {
         "messages": [
@@ -292,7 +292,7 @@ def _compose(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int6
 
 
 def _describe(summary: dict[str, Any], written: list[str]) -> str:
-    """What was put on packets, and where they are, for a person."""
+    """The summary of messages and the written files as text."""
     lines = [
         f"{m['kind']:9} {m['bytes']:5} bytes, transmitter {m['transmitter_id']}, sequence {m['sequence']}"
         for m in summary["messages"]
@@ -317,4 +317,4 @@ def keygen(
     from evlcp_sdk.air.signing import make_key, public_key, read_key
 
     public = public_key(read_key(private)) if show else make_key(private)
-    say(public, {"public_key": public}, as_json)
+    print_result(public, {"public_key": public}, as_json)

@@ -1,4 +1,4 @@
-"""`evlcp board stream`: packets onto a board as they come."""
+"""`evlcp board stream`: lines of input as packets on a board."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides
-from firmware_host.commands._json import AsJson, say
+from firmware_host.commands._json import AsJson, print_result
 from firmware_host.commands._line import open_board
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from firmware_host.board.stream import Stream
 
-_LOOK_S = 0.005
+_POLL_S = 0.005
 _MOST_LINES = 64
 
 Ahead = Annotated[
@@ -62,41 +62,41 @@ def stream(
     from evlcp_sdk.signals import stop_on_request
 
     link = load_link(link_file, overrides or [], Registry.load())
-    # before the board waits for packets
+    # a link without room for messages is refused before the board waits
     coder = link.block_coder() if lines == "text" else None
     if coder is not None:
         coder.encode_symbols(bytes(coder.block_bytes))
-    packets = _packets(file, link, coder, transmitter_id, repeat)
+    packets = _read_packets(file, link, coder, transmitter_id, repeat)
     with open_board(context) as board:
-        started = board.stream(link, ahead)
-        with contextlib.suppress(KeyboardInterrupt), stop_on_request() as asked, started:
-            for some in packets:
-                if asked():
+        queue = board.stream(link, ahead)
+        with contextlib.suppress(KeyboardInterrupt), stop_on_request() as stopped, queue:
+            for line in packets:
+                if stopped():
                     break
-                if some is None:
-                    started.wait(_LOOK_S)
+                if line is None:
+                    queue.wait(_POLL_S)
                     continue
-                for packet in takewhile(lambda _: not asked(), some):
-                    started.send(packet)
-    say_stream(started, as_json)
+                for packet in takewhile(lambda _: not stopped(), line):
+                    queue.send(packet)
+    print_stream_result(queue, as_json)
 
 
-def say_stream(stream: Stream, as_json: bool) -> None:
-    """Say what a stream did."""
+def print_stream_result(stream: Stream, as_json: bool) -> None:
+    """Print the result of a stream."""
     round_trips = round(stream.requests / max(1, stream.sent + stream.pauses), 3)
-    said = f"{stream.sent} packets, {round_trips:.2f} round trips a packet"
+    summary = f"{stream.sent} packets, {round_trips:.2f} round trips a packet"
     if stream.underruns:
-        said += f"; the board had none to play {stream.underruns} times and showed its idle pattern"
+        summary += f"; the board had none to play {stream.underruns} times and showed its idle pattern"
     else:
-        said += ", no underrun"
+        summary += ", no underrun"
     table = {"packets": stream.sent, "underruns": stream.underruns, "round_trips": round_trips}
-    say(said, table, as_json)
+    print_result(summary, table, as_json)
 
 
-def _packets(
+def _read_packets(
     file: Path, link: Link, coder: BlockCoder | None, transmitter_id: int, repeat: int
 ) -> Iterator[Iterable[NDArray[np.int64]] | None]:
-    """Packets (frames, clusters) of each line as it comes; None while none does."""
+    """Packets (frames, clusters) of each line of input; None while there is none."""
     import json
     import time
 
@@ -104,11 +104,11 @@ def _packets(
 
     from evlcp_sdk.errors import ConfigError, InputError
     from evlcp_sdk.link.compose import iterate_packets, make_messages
-    from firmware_host.board.symbols import symbols_of
+    from firmware_host.board.symbols import parse_symbols
 
     sequence = 0
     number = 0
-    for line in _lines(file):
+    for line in _read_lines(file):
         if line is None:
             yield None
             continue
@@ -118,55 +118,55 @@ def _packets(
         try:
             if coder is None:
                 table = json.loads(line)
-                while _depth(table) < 3:
+                while _list_depth(table) < 3:
                     table = [table]
                 place = Path(f"{file}: line {number}")
-                yield np.repeat(symbols_of(place, table, link), repeat, axis=0)
+                yield np.repeat(parse_symbols(place, table, link), repeat, axis=0)
             else:
-                # a later message has a higher number, also within a second
+                # the numbers of messages rise, also within a second
                 sequence = max(sequence + 1, int(time.time()))
-                said = make_messages(link, text=line, transmitter_id=transmitter_id, sequence=sequence)
-                yield iterate_packets(said, coder, repeat)
+                messages = make_messages(link, text=line, transmitter_id=transmitter_id, sequence=sequence)
+                yield iterate_packets(messages, coder, repeat)
         except (ValueError, RecursionError) as fault:
             raise InputError(f"{file}: line {number}: not JSON: {fault}") from fault
         except ConfigError as fault:
             raise InputError(f"{file}: line {number}: {fault}") from fault
 
 
-def _depth(table: Any) -> int:
+def _list_depth(table: Any) -> int:
     depth = 0
     while isinstance(table, list) and table and depth < 3:
         depth, table = depth + 1, table[0]
     return max(1, depth) if depth else 3
 
 
-def _lines(file: Path) -> Iterator[str | None]:
-    """Each line as it comes; None while none does."""
+def _read_lines(file: Path) -> Iterator[str | None]:
+    """Each line of input; None while there is none."""
     import queue
     import sys
     import threading
 
     from evlcp_sdk.errors import InputError
 
-    came: queue.Queue[str | Exception | None] = queue.Queue(_MOST_LINES)
+    received: queue.Queue[str | Exception | None] = queue.Queue(_MOST_LINES)
 
     def read() -> None:
         try:
             with contextlib.ExitStack() as stack:
                 opened = sys.stdin if str(file) == "-" else stack.enter_context(file.open(encoding="utf-8"))
                 for line in opened:
-                    came.put(line.rstrip("\r\n"))
-            came.put(None)
+                    received.put(line.rstrip("\r\n"))
+            received.put(None)
         except (OSError, ValueError) as fault:
-            came.put(fault)
+            received.put(fault)
 
-    # it may be waiting for input when the command ends
+    # it may still wait for input when the command ends
     threading.Thread(target=read, daemon=True).start()
     while True:
-        if came.empty():
+        if received.empty():
             yield None
             continue
-        line = came.get()
+        line = received.get()
         if line is None:
             return
         if isinstance(line, Exception):

@@ -1,4 +1,4 @@
-"""`evlcp tx`: what a transmitter would send."""
+"""`evlcp tx`: packets, words and light of a transmitter."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ def frames(
         with Outputs() as outputs:
             outputs.write_array(symbol_chips(table, link.codebook, link.packet.pilot_every), chips)
             outputs.commit()
-    echo(_FORMS[form](table, link))
+    echo(_FORMATTERS[form](table, link))
 
 
-def _words(codes: NDArray[np.uint8]) -> list[str]:
-    """Codes as words in hex, the last chip the least significant bit; empty ones of no chips."""
+def _format_words(codes: NDArray[np.uint8]) -> list[str]:
+    """Codes as hex words, the last chip the least significant bit; empty for codes of no chips."""
     from evlcp_sdk.air.codebook import word_of_chips
 
     if not codes.shape[1]:
@@ -68,8 +68,8 @@ def _words(codes: NDArray[np.uint8]) -> list[str]:
     return [f"{word_of_chips(code):0{width}x}" for code in codes]
 
 
-def _table(symbols: NDArray[np.int64], link: Link) -> str:
-    pilots, info = _words(link.codebook.pilots), _words(link.codebook.codewords)
+def _format_table(symbols: NDArray[np.int64], link: Link) -> str:
+    pilots, info = _format_words(link.codebook.pilots), _format_words(link.codebook.codewords)
     none = "-".rjust(len(pilots[0]))
     lines = ["packet frame cluster symbol pilot info"]
     for p, packet in enumerate(symbols.tolist()):
@@ -80,8 +80,8 @@ def _table(symbols: NDArray[np.int64], link: Link) -> str:
     return "\n".join(lines)
 
 
-def _hex(symbols: NDArray[np.int64], link: Link) -> str:
-    pilots, info = _words(link.codebook.pilots), _words(link.codebook.codewords)
+def _format_hex(symbols: NDArray[np.int64], link: Link) -> str:
+    pilots, info = _format_words(link.codebook.pilots), _format_words(link.codebook.codewords)
     return "\n".join(
         " ".join(
             (pilots[k] if link.packet.has_pilot(f) else "") + info[symbol] for k, symbol in enumerate(frame)
@@ -91,29 +91,29 @@ def _hex(symbols: NDArray[np.int64], link: Link) -> str:
     )
 
 
-def _json(symbols: NDArray[np.int64], link: Link) -> str:
+def _format_json(symbols: NDArray[np.int64], link: Link) -> str:
     import json
 
     from firmware_host.board.symbols import symbols_table
 
-    info = _words(link.codebook.codewords)
+    info = _format_words(link.codebook.codewords)
     return json.dumps(
         symbols_table(symbols, link)
         | {
-            "pilot_words": _words(link.codebook.pilots),
+            "pilot_words": _format_words(link.codebook.pilots),
             "info_words": [[[info[s] for s in frame] for frame in packet] for packet in symbols.tolist()],
         }
     )
 
 
-def _c(symbols: NDArray[np.int64], link: Link) -> str:
+def _format_c(symbols: NDArray[np.int64], link: Link) -> str:
     from evlcp_sdk.errors import ConfigError
 
     book = link.codebook
     bits = next((n for n in (16, 32, 64) if n >= link.packet.info_chips), None)
     if bits is None:
         raise ConfigError(f"--format c: info segments of {link.packet.info_chips} chips, at most 64")
-    info = _words(book.codewords)
+    info = _format_words(book.codewords)
     packets, frames, clusters = symbols.shape
     lines = [
         "/* Info words of evlcp tx frames; pilots and preamble are in codebook.h. */",
@@ -128,7 +128,7 @@ def _c(symbols: NDArray[np.int64], link: Link) -> str:
     return "\n".join([*lines, "};"])
 
 
-_FORMS = {"table": _table, "hex": _hex, "c": _c, "json": _json}
+_FORMATTERS = {"table": _format_table, "hex": _format_hex, "c": _format_c, "json": _format_json}
 
 
 @app.command(cls=JsonCommand)

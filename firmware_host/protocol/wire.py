@@ -38,7 +38,7 @@ class WireMessage:
 
     @classmethod
     @cache
-    def _fixed_struct(cls, minor: int = _LATEST) -> struct.Struct:
+    def _head_struct(cls, minor: int = _LATEST) -> struct.Struct:
         """The fields before one of any length."""
         return struct.Struct(
             "<" + " ".join(code for code in cls._struct_codes(minor).values() if code != "*")
@@ -47,7 +47,7 @@ class WireMessage:
     @classmethod
     def min_bytes(cls) -> int:
         """Length without a last field of any length, bytes."""
-        return cls._fixed_struct().size
+        return cls._head_struct().size
 
     @classmethod
     def is_open_ended(cls) -> bool:
@@ -73,7 +73,7 @@ class WireMessage:
                     raise DatagramError(f"{type(self).__name__}.{name}: {len(value)} bytes")
                 values.append(value)
         try:
-            return self._fixed_struct(minor).pack(*values) + rest
+            return self._head_struct(minor).pack(*values) + rest
         except struct.error as fault:
             raise DatagramError(f"{type(self).__name__}: {fault}") from fault
 
@@ -87,10 +87,10 @@ class WireMessage:
         size = cls.min_bytes()
         if len(data) < size:
             minors = {max(0, f.metadata.get("since", 0) - 1) for f in dataclasses.fields(cast(Any, cls))}
-            if len(data) not in {cls._fixed_struct(minor).size for minor in minors}:
+            if len(data) not in {cls._head_struct(minor).size for minor in minors}:
                 raise DatagramError(f"{cls.__name__}: {len(data)} bytes, expected {size}")
             data += bytes(size - len(data))
-        flat = list(cls._fixed_struct().unpack(data[:size]))
+        flat = list(cls._head_struct().unpack(data[:size]))
         values: list[Any] = []
         for code in cls._struct_codes().values():
             if code == "*":

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.link.resolve import load_link
-from firmware_host.board.bank import bank_of, random_symbols, symbol_chips
+from firmware_host.board.bank import make_bank, random_symbols, symbol_chips
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.emulators.listening import HostLine
@@ -53,7 +53,7 @@ def symbols_of(packets, seed=0, link=LINK):
 
 def some_bank(packets=1, seed=0, link=LINK):
     """Random packets of a link."""
-    return bank_of(symbols_of(packets, seed, link), link)
+    return make_bank(symbols_of(packets, seed, link), link)
 
 
 def board_on(line, nonce=None, **options):

@@ -20,7 +20,7 @@ from hypothesis import given, settings, strategies as st
 from evlcp_sdk.air.codebook import Codebook, hadamard
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError
-from firmware_host.board.bank import Bank, bank_of, random_symbols, symbol_chips
+from firmware_host.board.bank import Bank, make_bank, random_symbols, symbol_chips
 from firmware_host.board.board import Settings, profile_number, provision
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import IncompatibleError, RefusedError
@@ -110,7 +110,7 @@ def test_every_led_does_what_it_is_sent(device, board, form, overrides):
     link = board_link(*overrides)
     symbols = symbols_of(2, 1, link)
     chips = np.concatenate([packet_chips(one, link.codebook, link.packet.pilot_every) for one in symbols])
-    bank, leds = bank_of(symbols, link), leds_of(chips, link.bar.led_clusters())
+    bank, leds = make_bank(symbols, link), leds_of(chips, link.bar.led_clusters())
     assert bank.format == form
     check_plays(device, board, bank, leds)
     # a stream, whose idle pattern is no brighter and of the bar's LEDs alone, keeps to the same limit
@@ -183,8 +183,8 @@ def test_what_the_firmware_refuses(device, board):
     commit = protocol.CommitRequest(0, bank.format, 2, len(bank.content), bank.crc, digest)
     with pytest.raises(RefusedError):
         call(commit)  # CLUSTERS with a codebook
-    board.prepare(bank)
-    board.fill(0, bank.content)
+    board.prepare_commit(bank)
+    board.write_missing(0, bank.content)
     for name, wrong in (
         *[("format", form) for form in (Format.WORDS, Format.MASKS, 3)],
         *[("packets", count) for count in (0, 3, 65535)],
@@ -197,13 +197,13 @@ def test_what_the_firmware_refuses(device, board):
     overlapping = bytearray(bank.content)
     overlapping[12] |= overlapping[0]
     overlapping[13] |= overlapping[1]
-    board.fill(0, bytes(overlapping))
+    board.write_missing(0, bytes(overlapping))
     with pytest.raises(RefusedError) as caught:
         board.session.call(replace(commit, crc=zlib.crc32(overlapping)))
     assert (caught.value.status, caught.value.detail) == (Status.OUT_OF_RANGE, 1)
     with pytest.raises(RefusedError):
         board.session.call(protocol.StreamRequest(0, Format.CLUSTERS, commit.digest))
-    board.prepare(bank)
+    board.prepare_commit(bank)
     device.run(10_000)
     assert not device.lit_leds().any()
 
@@ -211,7 +211,7 @@ def test_what_the_firmware_refuses(device, board):
 def test_what_hello_says_decides(board):
     def says(**changes):
         for name, value in changes.items():
-            object.__setattr__(board.about, name, value)
+            object.__setattr__(board.info, name, value)
 
     with pytest.raises(RefusedError, match=r"no chip rate of 7777 Hz: must divide 10000000 Hz, at least 1,"):
         board.program(a_bank(chip_rate_hz=7777))
@@ -236,11 +236,11 @@ def test_what_hello_says_decides(board):
 
 
 def test_chips_that_the_board_has_none_as_long_as(device, board):
-    object.__setattr__(board.about, "chip_rate_min_hz", 1282)
+    object.__setattr__(board.info, "chip_rate_min_hz", 1282)
     link = board_link("air.chip_rate_hz=1000.0", "air.pilot_every=4")
     symbols = symbols_of(2, 6, link)
-    bank = bank_of(symbols, link)
-    assert (bank.format, bank.chip_by_chip().duty) == (Format.WORDS, bank.duty)
+    bank = make_bank(symbols, link)
+    assert (bank.format, bank.to_chip_format().duty) == (Format.WORDS, bank.duty)
     provision(board, bank, Settings(duty_limit=0.6))
     status = board.status()
     assert (status.chip_rate_hz, status.hold) == (2000, 2)
@@ -262,7 +262,7 @@ OPTIONS = options_of(*ANY)
 def test_the_commands(evlcp, tmp_path, device, board):
     link = board_link(*ANY)
     symbols = symbols_of(2, 3, link)
-    provision(board, bank_of(symbols, link), Settings())
+    provision(board, make_bank(symbols, link), Settings())
     device.run(200_000)
     record, out = tmp_path / "leds.bin", tmp_path / "chips.npy"
     record.write_bytes(device.take_led_record().to_bytes())
@@ -309,7 +309,7 @@ def test_the_image_of_the_part_plays_any_clusters_too(stm32):
     from tests.models.stm32 import US, Dma, lit_rows
 
     chip, board = stm32()
-    assert board.about.chip_rate_min_hz == 1282  # chips of 0.78 ms
+    assert board.info.chip_rate_min_hz == 1282  # chips of 0.78 ms
     provision(board, a_bank(), Settings(start=False))
     begin = len(chip.drivers.log)
     board.start()
@@ -341,7 +341,7 @@ def test_a_stream_rests_while_nothing_is_sent(serial, device, board):
 
 def test_what_would_be_characters_is_refused(serial, board):
     link, symbols, _ = serial
-    bank = bank_of(symbols[None], link)
+    bank = make_bank(symbols[None], link)
     with pytest.raises(ConfigError, match="watchdog = idle: LEDs that are on for a chip of two say"):
         provision(board, bank, Settings(watchdog=Watchdog.IDLE))
     provision(board, bank, Settings(watchdog=Watchdog.DARK, duty_limit=0.8, start=False))

@@ -14,7 +14,7 @@ import pytest
 import typer
 from board_lines import Native, check_fault, well
 
-from firmware_host.board.survey import find, survey
+from firmware_host.board.survey import find_board_port, survey_ports
 from firmware_host.emulators.led_record import RECORD, LedRecord
 from firmware_host.emulators.native import NativeBoard
 from firmware_host.errors import NoBoardError
@@ -282,13 +282,13 @@ def test_ports_are_asked(native, tmp_path):
     silent, other = pty.openpty()
     tty.setraw(other)
     listed = [SerialPort(p, usb="0403:6015") for p in (os.ttyname(other), native, "/dev/nowhere")]
-    assert [f.about is not None for f in survey(1_000_000, listed)] == [False, True, False]
-    assert find(1_000_000, listed) == native
+    assert [f.info is not None for f in survey_ports(1_000_000, listed)] == [False, True, False]
+    assert find_board_port(1_000_000, listed) == native
     with pytest.raises(NoBoardError, match=r"no board answers on any serial port .*asked: .*, /dev/nowhere;"):
-        find(1_000_000, [listed[0], listed[2]])
+        find_board_port(1_000_000, [listed[0], listed[2]])
     second = Native(f"unix:{tmp_path / 'second'}")
     with pytest.raises(NoBoardError, match="2 boards answer"):
-        find(1_000_000, [listed[1], SerialPort(f"unix:{tmp_path / 'second'}", usb="0403:6015")])
+        find_board_port(1_000_000, [listed[1], SerialPort(f"unix:{tmp_path / 'second'}", usb="0403:6015")])
     second.end()
     os.close(silent)
     os.close(other)

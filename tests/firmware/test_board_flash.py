@@ -14,7 +14,7 @@ from test_board_cli import Emulated
 
 from evlcp_sdk.errors import InputError
 from firmware_host import build
-from firmware_host.board.update import Package
+from firmware_host.board.update import UpdatePackage
 from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
 from firmware_host.images import FLASH_START, FlashImage
 from firmware_host.ports.rom import SECTORS, RomLoader, flash_image
@@ -31,7 +31,7 @@ def test_files_hold_one_image(evlcp, tmp_path):
         done = well(evlcp("board", "build", "--target", target, "-o", tmp_path / "new", "--json"))
         table = json.loads(done.out)
         *files, package = (Path(file) for file in table["files"])
-        assert Package.read(package) == Package.built(target)
+        assert UpdatePackage.read(package) == UpdatePackage.build(target)
         elf, hexed, binary = (FlashImage.read(path) for path in files)
         assert elf == hexed == binary
         assert (elf.address, len(elf.data)) == (FLASH_START, table["bytes"])
@@ -176,7 +176,7 @@ def test_the_image_for_another_crystal_boots_by_that_one(stm32):
     flash_image(RomLoader(RomLine(rom)), FlashImage.read(build.arm_image("stm32f405-12mhz")))
     flash = FlashImage(FLASH_START, bytes(rom.flash))
     _, board = stm32(flash, 12_000_000)
-    assert board.about.hal.rstrip(b"\0") == b"stm32f405"
+    assert board.info.hal.rstrip(b"\0") == b"stm32f405"
     for wrong, hse_hz in ((flash, 8_000_000), (FlashImage.read(build.arm_image("stm32f405")), 12_000_000)):
         with pytest.raises(AssertionError, match="not 168 MHz by this crystal"):
             stm32(wrong, hse_hz)

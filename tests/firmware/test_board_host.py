@@ -10,7 +10,7 @@ import pytest
 from board_lines import FatalLine, board_on, check_fault, some_bank, well
 
 from firmware_host.board.board import Board, Settings, provision
-from firmware_host.board.monitor import Back, Gone, watch
+from firmware_host.board.monitor import BoardGone, BoardReturned, watch_board
 from firmware_host.board.session import Session
 from firmware_host.board.stream import Stream
 from firmware_host.errors import LineError, NoBoardError, VerifyError
@@ -22,7 +22,7 @@ def test_a_host_that_stays_keeps_the_watchdog_still(device, board):
     done = provision(board, some_bank(2), Settings(watchdog=Watchdog.IDLE, watchdog_ms=300))
     assert (done.watchdog, done.watchdog_ms) == ("idle", 300)
     status = board.status()
-    board.stay(3.0, status)
+    board.wait_with_keep_alive(3.0, status)
     after = board.status()
     assert (after.state, after.faults) == (State.PLAYING, 0)
     assert after.uptime_ms - status.uptime_ms == pytest.approx(3000, abs=50)
@@ -33,21 +33,21 @@ def test_a_host_that_stays_keeps_the_watchdog_still(device, board):
     with pytest.raises(LineError, match="still PLAYING; try 'evlcp board blank'"):
         board.wait_dark(0.1)
     # one that plays on is asked nothing
-    board.watchdog(Watchdog.KEEP, 0)
+    board.set_watchdog(Watchdog.KEEP, 0)
     before = board.status()
-    board.stay(3.0, before)
+    board.wait_with_keep_alive(3.0, before)
     assert board.status().requests == before.requests + 1
 
 
 def test_program_keeps_alive_until_it_is_ended(evlcp, monkeypatch):
     stays = iter([Board.start, Board.blank])
 
-    def stay(board, seconds, status):
+    def wait_with_keep_alive(board, seconds, status):
         if (does := next(stays, None)) is None:
             raise KeyboardInterrupt
         does(board)
 
-    monkeypatch.setattr(Board, "stay", stay)
+    monkeypatch.setattr(Board, "wait_with_keep_alive", wait_with_keep_alive)
     done = well(evlcp("board", "program", "--random", 1, "--port", "native:", "--keep-alive"))
     assert done.err == "evlcp: native:: state dark, faults none\n"
 
@@ -86,8 +86,8 @@ def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp
 
 
 def test_a_bank_that_does_not_hold_is_reported(board, monkeypatch):
-    crc = board.crc
-    monkeypatch.setattr(board, "crc", lambda *place: crc(*place) ^ 1)
+    crc = board.read_crc
+    monkeypatch.setattr(board, "read_crc", lambda *place: crc(*place) ^ 1)
     with pytest.raises(VerifyError, match="does not hold what was sent") as caught:
         board.program(some_bank(2))
     assert "baud" not in str(caught.value)
@@ -129,16 +129,24 @@ def test_a_monitor_finds_its_board_again(device):
         return nullcontext(next(lines)())
 
     seen = []
-    for what in watch(opened, 0.01, count=6):
+    for what in watch_board(opened, 0.01, count=6):
         seen.append(what)
         if len(seen) == 6:
             device.reset()
     twice = [StatusReply] * 2
-    assert [type(s) for s in seen] == [*twice, Gone, Back, *twice, Gone, Back, *twice]
-    assert isinstance(seen[2], Gone)
+    assert [type(s) for s in seen] == [
+        *twice,
+        BoardGone,
+        BoardReturned,
+        *twice,
+        BoardGone,
+        BoardReturned,
+        *twice,
+    ]
+    assert isinstance(seen[2], BoardGone)
     assert "the line broke" in str(seen[2].fault)
-    assert isinstance(seen[3], Back)
+    assert isinstance(seen[3], BoardReturned)
     assert seen[3].after_s >= 0.5
     assert not list(lines)
     with pytest.raises(NoBoardError):
-        list(watch(off, 0.01, count=1))
+        list(watch_board(off, 0.01, count=1))

@@ -39,19 +39,19 @@ def excess(rows, duty):
 
 
 def test_all_ones_at_full_current_are_refused(device, board):
-    assert (board.about.level_max_ma, board.about.mean_max_ma, board.about.burst_chips) == (60, 30, BURST)
+    assert (board.info.level_max_ma, board.info.mean_max_ma, board.info.burst_chips) == (60, 30, BURST)
     provision(board, GOOD, Settings(level_ma=60))
     assert board.status().duty == 500
     with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*500 of 1000 chips.*lower the level") as refused:
         board.program(ONES)
     assert (refused.value.status, refused.value.detail) == (Status.TOO_BRIGHT, 500)
     device.run(100_000)
-    assert board.holds(GOOD, board.status())
+    assert board.is_active_bank(GOOD, board.status())
     assert board.status().state == State.PLAYING
     # what is too bright for 60 mA is not for 30, and the current stays below that then
     provision(board, ONES, Settings(level_ma=30))
     with pytest.raises(RefusedError, match="TOO_BRIGHT"):
-        board.level(31)
+        board.set_level(31)
     device.run(100_000)
     assert state_of(board) == (State.PLAYING, 0)
     assert (board.status().level_ma, board.status().duty) == (30, 1000)
@@ -62,11 +62,11 @@ def test_all_ones_at_full_current_are_refused(device, board):
 
 def test_limits_hold_at_once_and_outlive_a_reset_by_save(device, board):
     provision(board, GOOD, Settings(level_ma=40, start=False))
-    board.limit(GOOD, level_ma=25, duty=0.5)
+    board.set_limits(GOOD, level_ma=25, duty=0.5)
     assert limits(board) == (25, 25, 500)
     with pytest.raises(RefusedError, match="nearest value the board can take is 25"):
-        board.level(26)
-    board.limit(GOOD)  # nothing said, nothing changed
+        board.set_level(26)
+    board.set_limits(GOOD)  # nothing said, nothing changed
     board.save(autostart=True)
     device.reset()
     board = board_on(device)
@@ -74,14 +74,14 @@ def test_limits_hold_at_once_and_outlive_a_reset_by_save(device, board):
     # a limit below what plays: refused by host and board, with both numbers, and it plays on
     message = r"a LED on for 0\.5 of the time, the duty limit is 0\.4: .* at least 0\.5"
     with pytest.raises(RefusedError, match=message):
-        board.limit(GOOD, duty=0.4)
+        board.set_limits(GOOD, duty=0.4)
     with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*400 of 1000 chips"):
         board._configure(GOOD, 20, 400)
     device.run(200_000)
     assert state_of(board) == (State.PLAYING, 0)
     assert limits(board) == (25, 25, 500)
     with pytest.raises(RefusedError, match="nearest value the board can take is 60"):
-        board.limit(GOOD, level_ma=61)
+        board.set_limits(GOOD, level_ma=61)
     with pytest.raises(ConfigError, match="duty_limit = 0: expected"):
         Settings(duty_limit=0)
 
@@ -111,7 +111,7 @@ def test_a_duty_limit_fits_what_is_programmed_with_it(device, board):
     with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*545 of 1000 chips"):
         provision(board, ONES, Settings(level_limit_ma=55))
     assert limits(board) == (60, 60, 1000)
-    assert board.holds(dim, board.status())
+    assert board.is_active_bank(dim, board.status())
     assert board.status().state == State.PLAYING
 
 
@@ -135,8 +135,8 @@ def test_no_stretch_of_what_is_sent_is_beyond_the_limits(stream, stops):
     device = SimulatedBoard()
     board = board_on(device)
     bank = bank_of_rows(rows)
-    board.level(level_ma)
-    board.limit(bank, duty=limit)
+    board.set_level(level_ma)
+    board.set_limits(bank, duty=limit)
     duty = min(limit, (30_000 // level_ma) / 1000) if level_ma > 30 else limit
     mean = rows.mean(0).max()
     if mean > duty + 1e-9:
@@ -171,7 +171,7 @@ def test_no_stretch_of_what_is_sent_is_beyond_the_limits(stream, stops):
 
 
 def test_the_led_test_keeps_to_the_mean_current(device, board):
-    board.level(60)
+    board.set_level(60)
     board.test_leds(3, 4, 50)
     assert (device.bench.level_ma, board.status().level_ma) == (30, 60)
     device.run(60_000)

@@ -8,7 +8,7 @@ from board_lines import board_link, state_of, symbols_of, well
 from test_board_cli import Emulated
 
 from firmware_host import build
-from firmware_host.board.bank import Bank, bank_of, symbol_chips
+from firmware_host.board.bank import Bank, make_bank, symbol_chips
 from firmware_host.board.board import Settings, provision
 from firmware_host.errors import RefusedError
 from firmware_host.protocol.generated.requests import BoardFault, State
@@ -28,7 +28,7 @@ class Bar:
         self.chip = chip
         self.board = connect(chip)
         symbols = symbols_of(1, 1, FOUR)
-        provision(self.board, bank_of(symbols, FOUR), Settings(start=False))
+        provision(self.board, make_bank(symbols, FOUR), Settings(start=False))
         self.chips = symbol_chips(symbols, FOUR.codebook)
 
     def expected(self, count):
@@ -88,9 +88,9 @@ def test_registers_are_those_of_the_schematic(bar):
     assert (chip.plain[gpio_b], chip.plain[gpio_b + 0x0C]) == (1, 4)
     # SPI master of 16 bits at 10.5 MHz, the level as a share of 60 mA
     assert chip.spi.cr1 == 1 << 11 | 1 << 9 | 1 << 8 | 1 << 6 | 2 << 3 | 1 << 2
-    bar.board.level(30)
+    bar.board.set_level(30)
     assert chip.plain[0x40007408] == 30 * 4095 // 60
-    assert (bar.board.about.tick_hz, bar.board.about.hal.rstrip(b"\0")) == (14_000_000, b"stm32f405")
+    assert (bar.board.info.tick_hz, bar.board.info.hal.rstrip(b"\0")) == (14_000_000, b"stm32f405")
 
 
 def end_stream(chip):
@@ -322,8 +322,8 @@ def test_interrupts_stack_and_line_have_room(bar):
     spare = 1 - before.active_bank
     content = np.random.default_rng(1).integers(0, 256, 1_500, np.uint8).tobytes()
     began = chip.now
-    assert bar.board.fill(spare, content) == len(content)
-    assert bar.board.read(spare, 0, len(content)) == content
+    assert bar.board.write_missing(spare, content) == len(content)
+    assert bar.board.read_bank(spare, 0, len(content)) == content
     took_us = (chip.now - began) / US
     status = bar.board.status()
     assert (status.overflow_errors, status.crc_errors, status.framing_errors) == (0, 0, 0)

@@ -18,7 +18,7 @@ from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
-from firmware_host.board.bank import queue_of
+from firmware_host.board.bank import make_queue
 from firmware_host.board.board import Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import BoardResetError, IncompatibleError, RefusedError, VerifyError
@@ -85,7 +85,7 @@ def test_an_empty_queue_is_named_and_shows_the_idle_pattern(device):
 
 def status_of(stream):
     """STATUS in between; nothing of the stream is under way then."""
-    assert not stream._flight
+    assert not stream._in_flight
     return stream._session.call(protocol.StatusRequest())
 
 
@@ -107,7 +107,7 @@ def test_a_noisy_line_loses_and_doubles_nothing(device, seed):
 
 
 def test_the_watchdog_acts_on_a_stream_whose_host_is_gone(device, board):
-    board.watchdog(Watchdog.DARK, 200)
+    board.set_watchdog(Watchdog.DARK, 200)
     stream = board.stream(LINK)
     stream.send(symbols_of(1)[0])
     stream.wait(1.0)
@@ -151,7 +151,7 @@ def test_what_a_board_refuses(device, board):
         stream.send(symbols_of(1, 0, fast)[0])
     with pytest.raises(RefusedError, match="NOTHING_COMMITTED"):
         board.save()  # a stream is not
-    object.__setattr__(board.about, "capabilities", board.about.capabilities & ~Capability.STREAM)
+    object.__setattr__(board.info, "capabilities", board.info.capabilities & ~Capability.STREAM)
     with pytest.raises(IncompatibleError, match="has no streams"):
         board.stream(LINK)
 
@@ -185,8 +185,8 @@ def test_the_queue_takes_what_a_queue_should(data):
     link = board_link("air.frames_per_packet=320")  # 10 240 bytes a packet: 4 slots
     device = SimulatedBoard()
     board = board_on(device)
-    like = queue_of(link)
-    board.prepare(like)
+    like = make_queue(link)
+    board.prepare_commit(like)
     request = protocol.StreamRequest(0, Format.WORDS, bytes.fromhex(link.codebook.digest))
     slots = board.session.call(request).slots
     assert slots == 4
@@ -218,7 +218,7 @@ def test_the_queue_takes_what_a_queue_should(data):
     for _ in range(4 * 21):
         offset = len(model.part)
         push(len(model.packets), offset, bytes(min(490, 10_240 - offset)))
-    held = board.read(0, 0, 4 * 10_240)
+    held = board.read_bank(0, 0, 4 * 10_240)
     for n in range(max(0, len(model.packets) - 2), len(model.packets)):
         at = n % 4 * 10_240
         assert held[at : at + 10_240] == model.packets[n]

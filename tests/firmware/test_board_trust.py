@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 
 from firmware_host.board.board import Settings, provision
 from firmware_host.board.keys import make_board_key
-from firmware_host.board.monitor import KeyMissing, watch
+from firmware_host.board.monitor import KeyMissing, watch_board
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import RefusedError
 from firmware_host.protocol.datagram import Datagram, DatagramDecoder
@@ -36,7 +36,7 @@ def held_state(device):
 
 def test_a_locked_board_does_all_with_its_key_and_nothing_without(device):
     board = lock(device)
-    assert board.about.key_name == hashlib.sha256(KEY).digest()[:4]
+    assert board.info.key_name == hashlib.sha256(KEY).digest()[:4]
     assert provision(board, BANK, Settings(level_ma=15)).swapped
     assert board.verify(BANK) == 0
     with board.stream(LINK) as stream:
@@ -46,14 +46,14 @@ def test_a_locked_board_does_all_with_its_key_and_nothing_without(device):
     before = held_state(device)
     assert before[1] == 15
     stranger = board_on(device)
-    assert stranger.crc(0, 0, 100) >= 0
-    assert len(stranger.read(0, 0, 100)) == 100
+    assert stranger.read_crc(0, 0, 100) >= 0
+    assert len(stranger.read_bank(0, 0, 100)) == 100
     for refused in (
         stranger.stop,
         stranger.blank,
         stranger.start,
-        lambda: stranger.level(1),
-        lambda: stranger.watchdog(Watchdog.DARK, 100),
+        lambda: stranger.set_level(1),
+        lambda: stranger.set_watchdog(Watchdog.DARK, 100),
         lambda: stranger.set_key(None),
         stranger.save,
         stranger.recall,
@@ -81,7 +81,7 @@ def test_seals_are_hmac_sha256_of_any_length(count, key):
     data = bytes(n % 251 for n in range(count))
     written = board.session.call(protocol.WriteRequest(1, 7, data))
     assert written == protocol.WriteReply(1, 7, count)
-    assert not count or board.read(1, 7, count) == data
+    assert not count or board.read_bank(1, 7, count) == data
 
 
 def test_any_bit_that_is_changed_is_found(device):
@@ -138,7 +138,7 @@ def test_what_was_recorded_works_again_on_a_board_without_a_key_and_not_on_one_w
     provision(board, BANK, Settings(start=False))
     board.save()
     wire = session_of(device, KEY)
-    board_on(device, key=KEY).level(40)
+    board_on(device, key=KEY).set_level(40)
     # in a later session, with the HELLO of the recorded one, and after a reset
     for _ in range(2):
         before = held_state(device)
@@ -155,9 +155,9 @@ def test_nor_is_anything_done_twice_in_a_session(device, wraps):
     line = recording(device)
     board = board_on(line, key=KEY)
     line.written = b""
-    board.level(11)
+    board.set_level(11)
     first = line.written
-    board.level(44)
+    board.set_level(44)
     if wraps:
         client = board.session.client
         for _ in range(4):
@@ -185,27 +185,27 @@ def test_a_monitor_without_the_key_says_that_the_watchdog_acts(device):
         def opened():
             return contextlib.nullcontext(board_on(device, key=key))
 
-        return [type(seen) for seen in watch(opened, 0.01, count=2)]
+        return [type(seen) for seen in watch_board(opened, 0.01, count=2)]
 
-    board_on(device).watchdog(Watchdog.DARK, 1000)
+    board_on(device).set_watchdog(Watchdog.DARK, 1000)
     assert kinds(None) == [StatusReply] * 2
     lock(device)
     assert kinds(KEY) == [StatusReply] * 2
     assert kinds(None) == [KeyMissing, *[StatusReply] * 2]
-    board_on(device, key=KEY).watchdog(Watchdog.KEEP, 0)
+    board_on(device, key=KEY).set_watchdog(Watchdog.KEEP, 0)
     assert kinds(None) == [StatusReply] * 2
 
 
 def test_a_key_is_kept_and_changed(device):
     board = lock(device)
     device.reset()
-    assert not any(board_on(device).about.key_name), "not saved"
+    assert not any(board_on(device).info.key_name), "not saved"
     board = lock(device)
     provision(board, BANK, Settings(start=False))
     board.save()
     device.reset()
     board = board_on(device, key=KEY)
-    assert any(board.about.key_name)
+    assert any(board.info.key_name)
     board.set_key(OTHER)
     board.recall()
     with pytest.raises(RefusedError):
@@ -217,9 +217,9 @@ def test_a_key_is_kept_and_changed(device):
     device.replace_flash(bytes(flash))
     board = board_on(device, key=OTHER)
     assert board.recall().slot == 0
-    board.level(33)
+    board.set_level(33)
     board.set_key(None)
-    board_on(device).level(34)
+    board_on(device).set_level(34)
     assert device.bench.level_ma == 34
 
 
@@ -286,13 +286,13 @@ def test_the_image_of_the_part_seals(stm32):
     from tests.models.stm32 import connect
 
     chip, board = stm32()
-    challenges = {board.about.challenge}
+    challenges = {board.info.challenge}
     board.set_key(KEY)
-    challenges.add(board.about.challenge)
-    board.level(31)
+    challenges.add(board.info.challenge)
+    board.set_level(31)
     stranger = connect(chip)
-    challenges.add(stranger.about.challenge)
+    challenges.add(stranger.info.challenge)
     with pytest.raises(RefusedError):
-        stranger.level(32)
+        stranger.set_level(32)
     assert stranger.status().level_ma == 31
     assert len(challenges) == 3

@@ -51,8 +51,8 @@ def every_request(board, bank, update):
     """Say everything of protocol 2.0 once to a board that was just reset; what was answered."""
     call = board.session.call
     provision(board, bank, Settings(level_ma=11, start=False, level_limit_ma=40, duty_limit=0.75))
-    answers = [board.about.minor, board.verify(bank)]
-    board.watchdog(requests.Watchdog.IDLE, 60_000)
+    answers = [board.info.minor, board.verify(bank)]
+    board.set_watchdog(requests.Watchdog.IDLE, 60_000)
     answers += [board.save().slot, board.recall().slot]
     board.start()
     board.stop()
@@ -61,7 +61,7 @@ def every_request(board, bank, update):
     board.test_leds(0, 1, 1)
     board.wait_dark()
     with pytest.raises(RefusedError) as refused:
-        board.level(41)
+        board.set_level(41)
     answers.append((refused.value.status, refused.value.detail))
     spare = 1 - board.status().active_bank
     answers.append(

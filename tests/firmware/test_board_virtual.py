@@ -17,7 +17,7 @@ from board_lines import (
     symbols_of,
 )
 
-from firmware_host.board.bank import Bank, bank_of
+from firmware_host.board.bank import Bank, make_bank
 from firmware_host.board.board import Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import BoardResetError, IncompatibleError, NoBoardError, RefusedError
@@ -27,7 +27,7 @@ from firmware_host.protocol.generated.requests import MAJOR, MINOR, BoardFault, 
 
 def test_what_is_there_is_not_sent_again(board):
     symbols = symbols_of(64)
-    payload, half = bank_of(symbols, LINK), bank_of(symbols[:32], LINK)
+    payload, half = make_bank(symbols, LINK), make_bank(symbols[:32], LINK)
     seen = []
     done = board.program(payload, progress=lambda a, b: seen.append((a, b)))
     assert (done.written, done.length, done.swapped, done.bank) == (20480, 20480, True, 0)
@@ -35,20 +35,20 @@ def test_what_is_there_is_not_sent_again(board):
     assert seen == sorted(seen)
     again = board.program(payload)
     assert (again.written, again.swapped) == (0, False)
-    assert not board.holds(Bank.of_symbols(symbols, LINK.codebook, 4), board.status())
+    assert not board.is_active_bank(Bank.of_symbols(symbols, LINK.codebook, 4), board.status())
     assert board.program(half).bank == 1
     # bank 0 still holds the first payload: only the commit is needed
     back = board.program(payload)
     assert (back.written, back.swapped, back.bank) == (0, True, 0)
     symbols[40, 3, 5] ^= 1
     board.program(half)
-    assert board.program(bank_of(symbols, LINK)).written == 2048
+    assert board.program(make_bank(symbols, LINK)).written == 2048
 
 
 def test_hitless_swaps(device, board):
     payloads = {f"p{n}": symbols_of(1 + n % 4, 100 + n) for n in range(12)}
     for n, symbols in enumerate(payloads.values()):
-        provision(board, bank_of(symbols, LINK), Settings())
+        provision(board, make_bank(symbols, LINK), Settings())
         device.run(int(np.random.default_rng(n).integers(200_000, 500_000)))
     played = device.take_led_record().select_chips()
     assert (np.diff(played.ticks) == 1000).all(), "a chip was lost or late"
@@ -61,10 +61,10 @@ def test_hitless_swaps(device, board):
 def test_programming_over_a_very_noisy_line(device):
     board = board_on(NoisyLine(device, flips=2e-3, drops=0.01, doubles=0.01, seed=5))
     symbols = symbols_of(64, 6)
-    payload = bank_of(symbols, LINK)
+    payload = make_bank(symbols, LINK)
     assert provision(board, payload, Settings()).retries > 20
     device.run(3_000_000)
-    assert board.crc(0, 0, len(payload.content)) == payload.crc
+    assert board.read_crc(0, 0, len(payload.content)) == payload.crc
     sequence = packet_sequence(device.take_led_record().select_chips(), {"new": symbols})
     assert check_order(sequence, {"new": 64}) == ["new"]
     assert len(sequence) > 64
@@ -76,7 +76,7 @@ OLD = symbols_of(2, 1)
 def playing():
     """A board that plays OLD."""
     device = SimulatedBoard()
-    provision(board_on(device), bank_of(OLD, LINK), Settings())
+    provision(board_on(device), make_bank(OLD, LINK), Settings())
     device.run(50_000)
     return device
 
@@ -86,7 +86,7 @@ def test_host_killed_at_any_moment():
         raise KeyboardInterrupt
 
     new = symbols_of(24, 2)
-    bank = bank_of(new, LINK)
+    bank = make_bank(new, LINK)
     line = recording(playing())
     provision(board_on(line, nonce=7), bank, Settings())
     total = len(line.written)
@@ -106,7 +106,7 @@ def test_host_killed_at_any_moment():
         # the next host finishes the work
         board = board_on(device)
         assert provision(board, bank, Settings()).swapped == (order[-1] == "old")
-        assert board.holds(bank, board.status())
+        assert board.is_active_bank(bank, board.status())
     assert min(ends.values()) > 1
 
 
@@ -138,7 +138,7 @@ def test_save_survives_reset_and_damage(device, board):
     board = board_on(device)
     assert board.recall().slot == 1
     status = board.status()
-    assert board.holds(second, status)
+    assert board.is_active_bank(second, status)
     assert not board.program(second).written
     assert (status.level_ma, status.watchdog, status.watchdog_ms) == (33, Watchdog.IDLE, 700)
     held = bytearray(device.read_flash())
@@ -146,7 +146,7 @@ def test_save_survives_reset_and_damage(device, board):
     device.replace_flash(bytes(held))
     board = board_on(device)
     assert board.recall().slot == 0
-    assert board.holds(first, board.status())
+    assert board.is_active_bank(first, board.status())
     board.save(autostart=True)
     device.reset()
     device.take_led_record()
@@ -197,9 +197,9 @@ def test_board_reset_at_any_moment():
             reported.append(str(fault))
         board = board_on(device)
         if board.status().state == State.PLAYING:
-            assert board.holds(bank, board.status())
+            assert board.is_active_bank(bank, board.status())
         provision(board, bank, Settings())
-        assert board.holds(bank, board.status())
+        assert board.is_active_bank(bank, board.status())
         assert board.status().state == State.PLAYING
     # a reset before HELLO arrives, or after the last request, goes unnoticed by right
     assert len(reported) > 9

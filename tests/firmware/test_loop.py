@@ -9,7 +9,7 @@ from board_lines import LINK, well
 from firmware_host.board.bank import symbol_chips
 from firmware_host.emulators import simulated
 from firmware_host.emulators.led_record import LedRecord
-from firmware_host.loop import _received
+from firmware_host.loop import _describe_frames
 
 
 def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path):
@@ -69,4 +69,4 @@ def test_without_a_compiler(evlcp, tmp_path, monkeypatch):
 def test_wrong_bits_are_reported_of_a_light_without_a_distance_too():
     step = {"result": "1 transmitter", "frames": 9, "frames_sent": 10, "bits": 72, "bit_errors": 36}
     message = "9 of 10 frames, 36 of 72 bits wrong (BER 0.5)"
-    assert _received(step | {"distance_m": None}) == message
+    assert _describe_frames(step | {"distance_m": None}) == message
