@@ -563,8 +563,7 @@ def bound_areas(selected: Array, hits: Array, boxes: Array, total: Array) -> int
 def find_blobs(selected: Array, grid: int) -> tuple[Array, Array, Array]:
     """Connected cells (8 neighbours) of each cluster, largest first: mean column + row * 1j, cluster, cells.
 
-    Means are in pixels, `grid` to a cell's side. Blobs of one size stay in the order of clusters, rows and
-    columns.
+    Means are in pixels, `grid` to a cell's side. Blobs of one size are in the order of clusters and rows.
     """
     clusters, rows, columns = selected.shape
     room, lit = 0, np.empty((clusters, 2), np.int64)
@@ -701,7 +700,7 @@ def refine_similarity(
 
 
 @njit
-def _covered_share(off: float, half: float, grid: float) -> float:
+def _overlap_share(off: float, half: float, grid: float) -> float:
     """Share of a cell, `off` from the middle of a footprint, that the footprint covers."""
     return max(min(off + grid / 2, half) - max(off - grid / 2, -half), 0.0) / grid
 
@@ -731,8 +730,7 @@ def measure_core_profile(
     are interpolated linearly; those before the first have its value.
 
     Returns:
-        Number of distances that belong to the line: those before presence, beyond its peak, first falls below
-        `edge` of the peak.
+        Number of distances that belong to the line: up to presence of less than `edge` of its peak.
     """
     _, rows, columns = probability.shape
     hits, cells = np.zeros(out.size), np.zeros(out.size)
@@ -757,7 +755,7 @@ def measure_core_profile(
             for c in range(max(int((x - wide) / grid), 0), min(int((x + wide) / grid) + 1, columns)):
                 off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
                 off *= unit.conjugate()
-                share = _covered_share(off.real, spacing / 2, grid)
+                share = _overlap_share(off.real, spacing / 2, grid)
                 if share > 0 and abs(off.imag) < hits.size:
                     i = int(abs(off.imag))
                     cells[i] += share * share
@@ -803,8 +801,7 @@ def measure_pilot_light(
     (K,); it returns whether all do.
 
     `codes` are edges (K, n), one every `every` chips. A pixel's value is the sign of its sum in the chip
-    behind an edge, or 0; for edges in the middle of pairs it is else the opposite of the sign in the chip
-    before.
+    behind an edge, or 0; for edges inside pairs it is else the opposite of the chip before.
     """
     (clusters, _, columns), (out, lit) = prior.shape, light
     length = codes.shape[1]
@@ -938,8 +935,8 @@ def count_answers_across(
     """Count how pixels beside the middle of clusters answer the edges that tell clusters apart.
 
     `codes` are chips, with an edge behind the first and every `every` chips; `way` is the direction of the
-    line, of size 1; pixels within `along` of a middle count. `out` (2, 2 n + 1): answers and edges by column,
-    n to either side.
+    line, of size 1; pixels within `along` of a middle count. `out` (2, 2 n + 1): answers and edges, by
+    column.
     """
     chips = codes.shape[1]
     _, height, width = sums.shape
@@ -1005,9 +1002,9 @@ def mask_presence(
             for c in range(left, min(int((x + cells_right) / grid) + 1, columns)):
                 off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
                 off *= unit.conjugate()
-                share = _covered_share(off.real, spacing / 2, grid)
+                share = _overlap_share(off.real, spacing / 2, grid)
                 if not bins:
-                    share *= _covered_share(off.imag, spacing / 2, grid)
+                    share *= _overlap_share(off.imag, spacing / 2, grid)
                 else:
                     share *= profile[int(abs(off.imag))] if abs(off.imag) < wide else 0.0
                 if share > 0:
@@ -1050,8 +1047,8 @@ def measure_light(
     Lines are rows, or columns where `unit` lies flat. A line's light is the sum of the events within `reach`
     of the way that are in step with every `every`-th edge of `code`; `out` is this over the middle's, to the
     power of `_SHARPER`. Events that a moving image makes between edges are of opposite signs to both sides of
-    its middle, and some codes mark all edges by one sign: only sums over whole lines cancel these. Negative
-    sums count as 0.
+    its middle, and some codes mark all edges by one sign: only sums over lines cancel these. Negative sums
+    are 0.
 
     Returns:
         False if the middle has no light.
@@ -1101,8 +1098,7 @@ def measure_light(
 def find_boundary(mine: Array, its: Array, start: float, end: float) -> float:
     """Where two clusters meet, as a share of the way between their centres' lines; NaN if unseen.
 
-    In each line from `start` to `end`, the light of both (`measure_light`) gives the share that is the
-    first's.
+    In each line from `start` to `end`, the light of both (`measure_light`) gives the first's share.
     """
     # Centres within a pixel have no way between them that its lines could share out.
     if abs(end - start) < 1.0:
@@ -1124,8 +1120,8 @@ def find_boundary(mine: Array, its: Array, start: float, end: float) -> float:
 
 
 _ROUNDS_ACROSS = 4
-"""Each brings the window nearer to the middle by the share of the light that it holds: from half a cell to a
-hundredth of a pixel."""
+"""Each brings the window nearer to the middle by the share of the light that it holds: half a cell to .01
+px."""
 
 
 _TOP = 0.7
@@ -1442,8 +1438,7 @@ def calibrate_llr(
     A cluster's variance is pooled with that of all sizes of the frame and an expected one, a share of its
     mean squared; `expected` is what the first and the second are worth, in sizes, and the share. Clusters
     unseen, or with a symbol of -1, get LLRs of 0 and a symbol of -1; those whose probability is below the
-    first of `sure` get a symbol of -1 only. The second of `sure` is how many wrong symbols come together in a
-    frame.
+    first of `sure` get a symbol of -1 only. The second of `sure` is how many errors come together.
 
     Returns:
         Probability that all symbols given are right; 0 if none is.
@@ -1570,8 +1565,7 @@ def estimate_curvature(
     """Curvature of a parabola through boundaries, and its variance by their scatter about it; NaN of too few.
 
     `place` (n,) are where they are; `sums` (3, n) their weights, and weighted, their offsets and those of a
-    pixel- phase bias of 1; boundaries of less than `least` of the heaviest are left out. The phase bias is
-    `bias`.
+    pixel- phase bias of 1; those of less than `least` of the heaviest are left out. The phase bias is `bias`.
     """
     right, inverse = np.empty((2, 3)), np.empty((3, 3))
     weight = sums[0]
@@ -1709,8 +1703,7 @@ def assign_cells(
 ) -> tuple[int, int, float, int]:
     """Find which clusters are `seen` in their place (K,): by more cells than others have there.
 
-    A blob's cells are in place within `reach` of their cluster's place; others belong to the nearest place
-    within `half`.
+    A blob's cells are in place within `reach` of their cluster's place; others to the nearest within `half`.
 
     Returns:
         Places that show cells; those in which their cluster is seen; the cells of these; and the cells

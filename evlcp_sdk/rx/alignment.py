@@ -298,7 +298,6 @@ class FrameAligner:
         return places, right_px, down_px
 
     def _image_size(self, width_px: float, height_px: float) -> tuple[int, int]:
-        """The size of a region's image with its seam on both sides, made even."""
         seam_px = 2 * MARGIN_PX
         width_px, height_px = min(width_px, self._sensor_px[0]), min(height_px, self._sensor_px[1])
         # Twice an odd number: a bar of one or two columns stands in the middle of a cell of 2 px, not on the

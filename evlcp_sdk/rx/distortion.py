@@ -37,12 +37,11 @@ _CORRELATION_LENGTHS, _ERROR_SCALES = np.array([1.0, 2.0, 4.0]), np.array([1.0, 
 of it; and their sigma, in that of the residuals of a line."""
 
 _SCALE_SQUARE = 1.0
-"""Square of what a smooth distortion may add to a scale beyond that, in the squared residuals: one drop may
-cover much of a bar."""
+"""Square of what a smooth distortion may add to a scale beyond that, in squared residuals: a drop may cover
+much of a bar."""
 
 _MEMORY_S = 0.3
-"""Time in which a drop runs on by its width: for a moment it may bend nothing, and still stretch the
-image."""
+"""Time in which a drop runs on by its width: for a moment it may bend nothing, but stretch it."""
 
 _AVERAGE_S = 1.0
 """Time over which offsets are averaged: in that, a car nears by a sixth at most."""
@@ -205,8 +204,7 @@ def fit_straight(place: Floats, off_px: Floats, noise_px: float, steepest_px: fl
         place: Positions of the boundaries, in spacings, float64 (n,).
         off_px: Their offsets from an even scale, float64 (n,).
         noise_px: Sigma of the offsets.
-        steepest_px: How far a tilt may move the boundary at place 1; it moves others by the square of their
-            place.
+        steepest_px: How far a tilt may move the boundary at place 1; others go by the square of theirs.
     """
     n = len(place)
     if n < _MIN_BOUNDARIES:

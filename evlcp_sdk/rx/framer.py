@@ -52,9 +52,11 @@ def to_camera_time(value: Any, camera_us: Callable[[float], float]) -> Any:
 
 
 class Announcer:
-    """Announces what each finished stage gave, on the camera's clock, and how long it took."""
+    """Announces what each finished stage gave, on the camera's clock, and how long it took; nothing to
+    None.
+    """
 
-    def __init__(self, hook: Callable[..., Any], camera_us: Callable[[float], float]) -> None:
+    def __init__(self, hook: Callable[..., Any] | None, camera_us: Callable[[float], float]) -> None:
         self._hook, self._camera_us = hook, camera_us
         self.start_clock()
 
@@ -73,12 +75,17 @@ class Announcer:
         self._call_hook("frame", frame, self._lap_s - self._start_s)
 
     def _call_hook(self, stage: str, value: object, elapsed_s: float) -> None:
+        if self._hook is None:
+            return
         try:
             self._hook(stage=stage, value=to_camera_time(value, self._camera_us), elapsed_s=elapsed_s)
         except EvlcpError:
             raise
         except (Exception, SystemExit) as fault:
             raise PluginError(f"evlcp_stage_finished() of a plugin: {fault_text(fault)}") from fault
+
+
+SILENT = Announcer(None, float)
 
 
 @dataclass(frozen=True)
@@ -89,7 +96,7 @@ class StreamContext:
         clock: Its clock.
         attitude_at: The camera's attitude at a time, as far as it is known.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
-        announcer: Announces finished stages; None where nobody listens.
+        announcer: Announces finished stages.
         limits: How much each link holds at most.
         numbers: Where the numbers of transmitters come from.
         bar_decoders: The `BarDecoder`s of a link, by its name; None for those of this process.
@@ -98,7 +105,7 @@ class StreamContext:
     clock: CameraClock
     attitude_at: Callable[[float], Attitude | None]
     clock_zero: ClockZero = None
-    announcer: Announcer | None = None
+    announcer: Announcer = SILENT
     limits: Limits = LIMITS
     numbers: Iterator[int] = field(default_factory=count)
     bar_decoders: Callable[[str], Sequence[Any]] | None = None

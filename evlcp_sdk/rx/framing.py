@@ -122,8 +122,7 @@ class PendingFrame:
         due: Which frame.
         step_us: Start of the time step in which it was due, us.
         ranged: Its distance is measured.
-        fetch_result: Returns what was decoded, once that is known; None where the frame is to be decoded
-            again, here.
+        fetch_result: Returns what was decoded, once that is known; None to decode the frame again, here.
         frame: The same as published, if it was already.
     """
 
@@ -140,8 +139,7 @@ class PacketFraming(Framer):
 
     `follower` is `regions` again where frames correct them; None where they stay as a detector has them.
     Decoded frames go to the `queue`. Frames of a bar that its region follows steadily are decoded by
-    themselves, and applied a fixed number of time steps later, so that the result is the same whoever decodes
-    them.
+    themselves, and applied a fixed number of time steps later, so that it does not matter who decodes them.
     """
 
     drops_cut_frames = True
@@ -297,8 +295,7 @@ class PacketFraming(Framer):
         for start_us, events in pieces:
             self.counts["events_in_regions"] += events.t_us.size
             until_us = min(start_us + self._step_us, step.end_us)
-            if self._announcer is not None:
-                self._announcer.start_clock()
+            self._announcer.start_clock()
             try:
                 transmitter.sync, locks = self._synchronizer.step(
                     transmitter.sync, events.t_us, events.p, until_us
@@ -309,8 +306,7 @@ class PacketFraming(Framer):
             if guard.checks:
                 guard.expect_locks(locks, until_us, self._packet)
             for lock in locks:
-                if self._announcer is not None:
-                    self._announcer.announce("synchronization", lock)
+                self._announcer.announce("synchronization", lock)
                 self.counts["preambles"] += 1
                 lock = self._correct_row_delay(transmitter, lock)
                 transmitter.step_events = events.t_us.size
@@ -405,11 +401,10 @@ class PacketFraming(Framer):
             self._queue_frame(transmitter, due, found)
 
     def _announce_skipped(self, transmitter: Transmitter, due: DueFrame, why: Skipped) -> None:
-        if self._announcer is not None:
-            packet = None if transmitter.first_packet is None else due.packet - transmitter.first_packet
-            t_us = self._clock.camera_us(due.start_us)
-            skipped = SkippedFrame(transmitter.number, packet, due.index, t_us, why.value, self._name)
-            self._announcer.announce("skipped", skipped)
+        packet = None if transmitter.first_packet is None else due.packet - transmitter.first_packet
+        t_us = self._clock.camera_us(due.start_us)
+        skipped = SkippedFrame(transmitter.number, packet, due.index, t_us, why.value, self._name)
+        self._announcer.announce("skipped", skipped)
 
     def _queue_frame(self, transmitter: Transmitter, due: DueFrame, found: FrameDetection) -> None:
         if transmitter.grid.frame <= due.number:
@@ -421,15 +416,13 @@ class PacketFraming(Framer):
         self._queue.add(transmitter.assembler, found)
 
     def _record_light(self, transmitter: Transmitter, start_us: float) -> None:
-        """Record that a transmitter's light was there in a frame that started then, camera clock, us."""
         if transmitter.first_lit_us is None:
             transmitter.first_lit_us = start_us
         if transmitter.number is not None:
             record_light(self.light_spans_us, transmitter.number, transmitter.first_lit_us, start_us)
 
     def _decode_frame(self, transmitter: Transmitter, due: DueFrame) -> FrameDetection | Skipped:
-        if self._announcer is not None:
-            self._announcer.start_clock()
+        self._announcer.start_clock()
         due = self._retime_frame(transmitter, due)
         aligned = self._align_frame(transmitter, due)
         if aligned is None:
@@ -479,14 +472,12 @@ class PacketFraming(Framer):
         )
         if self._on_frame is not None:
             self._on_frame(frame)
-        if self._announcer is not None:
-            self._announcer.announce_frame(frame)
+        self._announcer.announce_frame(frame)
         return frame
 
     def _build_detection(
         self, transmitter: Transmitter, due: DueFrame, found: FrameResult, frame: Frame
     ) -> FrameDetection:
-        """The detection of a decoded frame; counts what its reading warns of."""
         self._add_count(transmitter, "frames_askew", found.reading.line_of_sight.askew)
         self._add_count(transmitter, "frames_flooded", found.reading.flooded)
         times = due.start_us, due.end_us, due.packet_us, due.lock.chip_us
@@ -495,15 +486,13 @@ class PacketFraming(Framer):
     def _is_steady(self, transmitter: Transmitter) -> bool:
         """Whether frames of a transmitter can be decoded by themselves.
 
-        A region that sweeps over the image is soon off by more than its seam: each of its frames has to
-        correct it.
+        A region that sweeps over the image is soon off by its seam: each frame has to correct it.
         """
         still = transmitter.region.velocity_px_us == STILL and self._follower is not None
         return still and not transmitter.strayed and transmitter.number is not None
 
     def _submit_frame(self, transmitter: Transmitter, due: DueFrame) -> None:
-        if self._announcer is not None:
-            self._announcer.start_clock()
+        self._announcer.start_clock()
         assert transmitter.number is not None
         if transmitter.decoder is None:
             transmitter.decoder = min(self._bar_decoders, key=len)
@@ -529,7 +518,6 @@ class PacketFraming(Framer):
             self._apply_frame(pending[0])
 
     def _apply_frame(self, pending: PendingFrame) -> None:
-        """Correct a region by a pending frame, and queue the frame."""
         transmitter, due, found = pending.transmitter, pending.due, pending.fetch_result()
         if found is None:
             # This frame, and those after it, are decoded here, with what surrounds the region.
@@ -633,7 +621,6 @@ class PacketFraming(Framer):
         return True
 
     def _unite_parts(self, transmitter: Transmitter) -> bool:
-        """Unite a region that shows a part of a bar with others in step with it; False without any."""
         parts = self._transmitters.find_in_step(transmitter)
         if self._follower is None or transmitter.region.id in self._dropped or not parts:
             return False
@@ -654,11 +641,9 @@ class PacketFraming(Framer):
             self._transmitters.release(transmitter)
 
     def _count_as_parts(self, missed: Counter[str]) -> None:
-        """Count misses of a part of a bar apart from those of whole bars."""
         self.counts["frames_of_parts"] += self._uncount(missed)
 
     def _claim_ended_parts(self, region: TrackedRegion, t_us: float) -> None:
-        """Find regions that ended and were parts of a bar whose first frame is decoded."""
         for one in list(self._ended):
             number, place_px, missed = one
             if number is None and _is_part(region, t_us, place_px, self._fade_us):
@@ -666,7 +651,6 @@ class PacketFraming(Framer):
                 self._count_as_parts(missed)
 
     def _end_transmitter(self, transmitter: Transmitter, now_us: float) -> None:
-        """Decode what a region that has ended still shows; its last packet is over."""
         seen_us = transmitter.region.latest.t_us + self._step_us
         until_us = min(now_us - self._tail_us, seen_us)
         self._decode_due(transmitter, until_us)

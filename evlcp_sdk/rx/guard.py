@@ -42,8 +42,7 @@ class Guard:
     """A context in which code of one algorithm runs: what it raises becomes a `PluginError` that names it.
 
     Interrupts pass, and `ConfigError` where an algorithm may refuse its configuration. The original exception
-    is the cause. `expect` and its like check what an algorithm gave, and raise an error with that and what
-    was expected.
+    is the cause. `expect` and its like check what an algorithm gave, and raise an error that shows it.
 
     Args:
         link: The configuration that names the algorithm.

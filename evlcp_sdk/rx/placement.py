@@ -14,8 +14,7 @@ _MIN_SPACING_PX = 1.0
 
 _MAX_CHANCE = 1e-3
 """Probability of so many clusters in their places by chance, above which it takes `min_share` of the
-clusters, too: of a thousand frames decoded at a wrong time one would pass, and a lock needs two preambles at
-the right distance before."""
+clusters, too: of a thousand frames at a wrong time one would pass, and a lock takes two preambles."""
 
 _MAX_PROPOSERS = 64
 """Blobs that propose placements, the largest first: four for each of 16 clusters, a bar and its mirror image
@@ -33,8 +32,7 @@ _LINE_MARGIN_PX = 8
 
 _MIN_LIGHT = 0.25
 """Least light in step with its own pilot that a visible cluster's place has, in the median of the others'. In
-recordings hidden clusters have up to 0.04, and the dimmest visible one, 180 m away or in a shaking camera,
-0.58."""
+recordings hidden clusters have up to 0.04, and the dimmest visible one, 180 m away or shaking, 0.58."""
 
 _MIRRORED_FACTOR = 1.1
 """How much more a mirror image has to explain than the layout itself: of a single column or row in view both
@@ -70,8 +68,7 @@ class Placement:
         scale: Size and turn, px/m; 0 for a layout of one cluster, which has none.
         shift: Image of the layout's origin, px.
         mirrored: The image shows the layout's mirror image. A line of clusters is its own mirror image;
-            there, the order of the clusters runs up the image, or to the left: in a mirror on the road, and
-            in a camera upside down.
+            there, the clusters run up the image, or left, as in a mirror on the road or upside down.
         seen: Clusters that stand in their place, bool (K,).
         cells: Grid cells that show a cluster in its place.
         chance: Upper bound of the probability of so many clusters in their places by chance.
@@ -129,8 +126,7 @@ def find_placements(
     Sixteen pilots of eight values are half of all that chance can show, so that a frame decoded at a wrong
     time shows clusters, too; but not in their order. One that is in its place without having proposed it is
     there with a chance of one in K. The best instance counts if its chance is small, or if `min_share` of the
-    clusters are in their place: with few clusters any order is likely. All others count if their chance is
-    small.
+    clusters are in their place: with few clusters any order is likely. All others need a small chance.
 
     Args:
         presence: Of one frame.
@@ -175,7 +171,6 @@ def find_placements(
 
 
 def _cell_reach_px(scale: complex, layout: Layout, slack_px: float) -> float:
-    """How far around a cluster's place its cells are."""
     return abs(scale) * layout.spacing_m / 2 + slack_px
 
 
@@ -184,8 +179,7 @@ def mask_presence(presence: PresenceMap, layout: Layout, placement: Placement) -
 
     Along the layout a cell shows the clusters whose shares of it are in it. Across a line, whose width is not
     in the layout, the cells of all clusters together show how likely a cell is so far from the axis. Beyond
-    are a halo, neighbours and reflections. Pixel maps keep a spacing, so that they still show where a cluster
-    ends.
+    are a halo, neighbours and reflections. Pixel maps keep a spacing, to show where a cluster ends.
     """
     if placement.scale == 0:
         return presence

@@ -131,7 +131,6 @@ class PluginFraming(Framer):
         self._queue.add(deframed.assembler, None)
 
     def _queue_frames(self, deframed: _DeframedRegion, decoded_frames: list[DecodedFrame]) -> None:
-        """Check, number and place the frames of a region, publish them, and put them into the queue."""
         self._add_counts(deframed)
         for decoded in decoded_frames:
             self._check_frame(decoded, deframed.last)
@@ -157,8 +156,7 @@ class PluginFraming(Framer):
             self.counts["frames"] += 1
             if self._on_frame is not None:
                 self._on_frame(frame)
-            if self._announcer is not None:
-                self._announcer.announce_frame(frame)
+            self._announcer.announce_frame(frame)
             record_light(self.light_spans_us, deframed.number, frame.t_us, frame.t_us)
             times, light = (decoded.t_us, end_us, decoded.packet_t_us, decoded.chip_us), deframed.events
             detection = FrameDetection(
@@ -169,7 +167,6 @@ class PluginFraming(Framer):
             deframed.events = 0
 
     def _check_frame(self, decoded: DecodedFrame, last: tuple[int, int]) -> None:
-        """Check a frame, which comes after the packet and frame `last`."""
         guard, chip_us = self._guard, self._packet.chip_us
         guard.expect(decoded, DecodedFrame)
         guard.expect_symbols(decoded.soft, self._codebook)
@@ -185,7 +182,6 @@ class PluginFraming(Framer):
             )
 
     def _add_counts(self, deframed: _DeframedRegion) -> None:
-        """Add what the framing has counted since it was asked last."""
         with self._guard:
             found = self._deframer.counts(deframed.state)
         self._guard.expect(found, Mapping)

@@ -43,14 +43,12 @@ def compile_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> Find
     without a neighbour moves outward by a third of a pixel, is not used: beyond the last boundary the spacing
     of the others counts. Pixels out of place are outside of the window about the cluster's place.
 
-    The bar's centre is that of the points, as they are finer than the cells that placed the layout; without
-    any, that of the cells.
+    The bar's centre is that of the points, which are finer than the cells, or without any, of these.
 
     `edges` are those of the clusters' pilots, from each chip to the next, int64 (K, n); `every` is the number
     of chips from one of those that tell clusters apart to the next, the first of which is that into chip 1.
 
-    Sigma is the scatter of the points about their best similarity with the layout, pooled with the prior, and
-    larger at the ends.
+    Sigma is the scatter of the points about their best similarity, pooled with the prior, larger at the ends.
     """
     clusters, spacing_m = len(layout.centres_m), layout.spacing_m
     neighbours = np.full((2, clusters), -1, np.int64)

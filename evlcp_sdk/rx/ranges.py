@@ -48,8 +48,7 @@ _TILT_STEP_DEG = 0.1
 
 _NOT_PLUMB_SHARE = 6e-5
 """Share of the bars that are not plumb, or seen with a wrong attitude: they may have any tilt up to the
-steepest. As rare as an outlier, so that it adds nothing to other sigmas, and enough to accept a curvature
-that contradicts."""
+steepest. As rare as an outlier: it adds nothing to other sigmas, but accepts a curvature that contradicts."""
 
 _BIAS_SHARE, _BIAS_REST_PX = 0.6, 0.03
 """Share of the pixel-phase bias that distances have, and its error (sigma), px: rows far off a fit hardly
@@ -73,8 +72,8 @@ class RangeState(NamedTuple):
         tilt_known: The attitude gave the tilt then.
         bias_sums: Evidence of the pixel-phase bias, see `_kernels.add_phase_bias`, float64 (4,).
         distortion: Of the bar's image.
-        offset: Of the boundaries, as in `Curvature`, beyond the known tilt, in the newest frame, NaN where
-            unseen, float64 (n,).
+        offset: Of the boundaries, as in `Curvature`, beyond the known tilt, in the newest frame, float64
+            (n,); NaN if unseen.
     """
 
     past: Floats = np.empty((0, 3))

@@ -13,7 +13,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Tracker
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame, FrameAligner, Pilot
-from evlcp_sdk.rx.framer import Announcer
+from evlcp_sdk.rx.framer import SILENT, Announcer
 from evlcp_sdk.rx.guard import Guard, compile_algorithm, compile_tracker
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import compile_finder
@@ -29,8 +29,7 @@ _FRAME_WORTH = 6.0
 while some have a panel or leaves behind them."""
 
 _EXPECTED_SPREAD, _EXPECTED_WORTH = 0.4, 6.0
-"""Standard deviation of the sizes of LLRs, in their mean, before any is known, and how many LLRs it is
-worth."""
+"""Standard deviation of the sizes of LLRs, in their mean, before any is known, and its worth in LLRs."""
 
 _MIN_PROBABILITY = 0.6
 """Probability of being right against its nearest rival below which a symbol is not given: it has other
@@ -42,8 +41,7 @@ too. In `examples/campaigns/road.toml` they are 1.9 to 2.2 by decoding, as `benc
 a Gaussian channel 1 to 1.3, as long as less than half of the frames are wrong."""
 
 _MIN_EVENT_SHARE = 0.5
-"""Share of the expected events, by the edges of the codeword with the fewest, that may be missing by
-chance."""
+"""Share of the expected events, by the codeword with the fewest edges, that chance may take."""
 
 _FLOODED_SHARE, _FLOODED_RATIO, _DIMMED_SHARE = 0.2, 1.25, 0.45
 """A frame is flooded, its light changes everywhere and nothing that the pilot showed holds, if in pixels
@@ -65,7 +63,7 @@ _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
 class Steps:
     """The algorithms that decode a frame, checked and announced; it keeps no state of a stream."""
 
-    def __init__(self, link: Link, announcer: Announcer | None, tracker: Tracker) -> None:
+    def __init__(self, link: Link, announcer: Announcer, tracker: Tracker) -> None:
         self._codebook = link.codebook
         self._corrector = RangeCorrector()
         self._announcer = announcer
@@ -87,8 +85,7 @@ class Steps:
             presence: PresenceMap = self._separate(sums)
         if guard.checks:
             guard.expect_presence(presence, self._codebook.clusters, *sums.shape[1:])
-        if self._announcer is not None:
-            self._announcer.announce("separation", presence)
+        self._announcer.announce("separation", presence)
         return presence
 
     def decode(
@@ -101,7 +98,7 @@ class Steps:
         """Decode the clusters' symbols from polarity sums of pilot and info, int16 (chips, height, width).
 
         For codes that are no pair codes the chips sent before and after the info segment matter, and the sums
-        include the chip after it.
+        have the chip after it.
         """
         guard = self._guards["decoding"]
         more = () if self._codebook.is_pair_coded else (before, after)
@@ -109,21 +106,18 @@ class Steps:
             soft = self._decode(presence, sums, *more)
         if guard.checks:
             guard.expect_symbols(soft, self._codebook)
-        if self._announcer is not None:
-            self._announcer.announce("decoding", soft)
+        self._announcer.announce("decoding", soft)
         return soft
 
     def measure(self, view: FrameView) -> Range:
         """Measure the distance of the bar."""
         guard = self._guards["ranging"]
-        if self._announcer is not None:
-            self._announcer.announce("view", view)
+        self._announcer.announce("view", view)
         with guard:
             distance: Range = self._measure(view)
         if guard.checks:
             guard.expect_range(distance)
-        if self._announcer is not None:
-            self._announcer.announce("ranging", distance)
+        self._announcer.announce("ranging", distance)
         return distance
 
     def track_distance(
@@ -167,8 +161,7 @@ class FrameReading(NamedTuple):
         sigma_px: Their standard deviations, px, float64 (K,).
         flank_px: See `Frame.points_flank_px`.
         centre_px: Column and row of the bar's centre on the sensor, px.
-        line_of_sight: Of the bar, with its tilt as far as the attitude gives it; the default one for a panel,
-            which has no direction.
+        line_of_sight: Of the bar, with its tilt as far as the attitude gives it; the default one for a panel.
         spread: Measures how light spreads in it; None without a pilot.
         flooded: Light changes everywhere in it, so that no symbol is given.
     """
@@ -331,7 +324,7 @@ class FrameDecoder:
         steps: The link's algorithms.
     """
 
-    def __init__(self, link: Link, announcer: Announcer | None = None) -> None:
+    def __init__(self, link: Link, announcer: Announcer = SILENT) -> None:
         self.steps = Steps(link, announcer, compile_tracker(link))
         self.aligner = FrameAligner(
             link.packet,

@@ -57,8 +57,8 @@ _MAX_SHARP_ODDS = 4.0
 _TWO_BARS_HOLD = 1.0
 """Log odds that it takes to change whether two images are two bars. At first it is whatever fits better:
 mirrors are more common, but to leave a bar out costs its place and its data, and a mirror taken for one is
-warned of. Equal bars have 2 to 4, those of .6 of the light 0 to 2; mirrors that keep a third of it, or blur
-it, mostly -2 and less."""
+warned of. Equal bars have 2 to 4, those of .6 of the light 0 to 2; mirrors that keep a third, or blur it, -2
+and less."""
 
 _COMPARE_AGAIN = 1.25
 """Growth of the frames in common after which their sharpness is compared again."""
@@ -77,8 +77,7 @@ _LOOKBACK_PACKETS = 3
 """Packets of frames remembered: a new transmitter begins with the last two packets before its lock."""
 
 _REMEMBER_US = 1e6
-"""How long two transmitters stay one without a frame in common, and how long one lost from sight is
-remembered."""
+"""How long two transmitters stay one without a frame in common, and one lost from sight is remembered."""
 
 
 class FrameDetection(NamedTuple):
@@ -110,8 +109,7 @@ class FrameDetection(NamedTuple):
 def repetition_llr(one: NDArray[np.int64], other: NDArray[np.int64], codewords: int) -> float:
     """Log-likelihood ratio of one frame repeating another's symbols against being independent of it.
 
-    Both are symbols of clusters, int64 (K,), out of `codewords`; where either is -1, not given, they do not
-    count.
+    Both are symbols of clusters, int64 (K,), out of `codewords`; -1 is not given, and does not count.
 
     >>> symbols = np.arange(16)
     >>> repetition_llr(symbols, symbols, 64) > 20, repetition_llr(symbols, symbols[::-1], 64) < -3
@@ -386,8 +384,7 @@ class ReflectionQueue:
     """Holds decoded frames for a time step, so that a bar and its reflection are compared together.
 
     Their frames end within a chip of each other, but maybe not in the same step, and a new transmitter begins
-    with the frames before its lock. What the queue gives is marked by all frames up to the step after its
-    own.
+    with the frames before its lock. What it gives is marked by all frames up to the step after.
 
     Attributes:
         reflections: Finds reflections among the frames.

@@ -72,8 +72,8 @@ their lights: LEDs age, gather dirt and point elsewhere."""
 
 _ANSWER_ERROR, _ANSWER_SPREAD, _ANSWER_IMAGE_SPREAD = 0.018, 0.02, 0.04
 """Share of edges that the middle of a line answers: its error in a frame, how much two bars differ all the
-same, as they lie on their pixels, and a bar and its image (sigmas). Brighter light decays longer, so that
-more edges are lost."""
+same, as they lie on their pixels, and a bar and its image (sigmas). Brighter light decays longer, losing more
+edges."""
 
 _STEPS_PER_E = 4
 """Steps of the spacing in a factor of e; the expected lengths change little in one."""
@@ -251,7 +251,6 @@ def _log_likelihood(here: Floats, there: Floats, length: int, error_px: float) -
 
 @lru_cache(maxsize=32)
 def _lengths_at_step(steps: int) -> Floats:
-    """Expected lengths for each blur and each background, px, float64 (n, 3), at a step of the spacing."""
     return model_lengths(math.exp(steps / _STEPS_PER_E), _BLURS_PX, _BACKGROUNDS)
 
 

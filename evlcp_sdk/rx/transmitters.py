@@ -3,8 +3,7 @@
 A transmitter is numbered at its first frame, and remembered when lost from sight. Its frames are on a grid of
 packets, which a lock sets. Its rows are delayed: a sensor reads them one after another, 0.1 to 0.35 us each,
 those without an event in no time. All clusters of a bar change together at the preamble's edges, as they do
-in the middle of every value, so that its rows wait for one another: 20 us from end to end at 50 m, 90 us at
-16 m.
+in the middle of every value, so that its rows wait for one another: 20 us at 50 m, 90 us at 16 m.
 """
 
 import cmath
@@ -58,8 +57,7 @@ _PLACE_SIGMA_US = 2.0
 
 _MIN_COHERENCE, _MAX_OFFSET_CHIPS = 0.5, 0.25
 """How near to one another in a chip events come, 0 to 1, for their time to be known; and how far off its
-middle they may be. In bright light they are so by 0.6 to 0.8, and off by an eighth; in the dim they fill
-chips."""
+middle they may be. In bright light they are so by 0.6 to 0.8, and off by an eighth; dim ones fill chips."""
 
 
 @dataclass
@@ -68,7 +66,7 @@ class PacketGrid:
 
     Attributes:
         format: Lengths of a packet's parts.
-        chips_after: Chips after a frame that are read with it (`Codebook.trailing_chips`).
+        trailing_chips: Chips after a frame that are read with it (`Codebook.trailing_chips`).
         lock: The newest lock; None before the first.
         packet: Number of the lock's packet, counted from the first that may have a frame here.
         frame: Next frame to decode, counted from the first of packet 0.
@@ -76,7 +74,7 @@ class PacketGrid:
     """
 
     format: PacketFormat
-    chips_after: int = 0
+    trailing_chips: int = 0
     lock: SyncLock | None = None
     packet: int = 0
     frame: int = 0
@@ -135,7 +133,7 @@ class PacketGrid:
             start_us=start_us,
             end_us=end_us,
             lock=lock,
-            read_us=end_us + self.chips_after * lock.chip_us,
+            read_us=end_us + self.trailing_chips * lock.chip_us,
             middle_us=float(start_us) + min(end - begin, form.pilot_chips) // 2 * float(lock.chip_us),
         )
 
@@ -201,8 +199,8 @@ def retime_lock(lock: SyncLock, start_us: float, pieces: Iterable[tuple[int, Eve
     """Correct a lock by when in a chip a region's events come from a time on.
 
     In bright light events come close together in the middle of a chip; where they are off it, light or
-    readout were slower before, and events come sooner now. A lock whose events are spread or in the middle is
-    returned as it is.
+    readout were slower before, and events come sooner now. A lock with spread or centred events is returned
+    as it is.
     """
     turn, total = 0j, 0
     for _, e in pieces:
@@ -232,10 +230,8 @@ class Transmitter:
         number: Transmitter number, None before the first frame.
         first_packet: Number of the first packet on the grid that had a frame, None before.
         row_delay: Of its bar.
-        last_confirmed: Number of the newest frame on the grid before any was rejected since the newest
-            preamble on it.
-        unconfirmed: Frames since the first that was rejected since then, by count: another transmitter may
-            send.
+        last_confirmed: The newest frame on the grid before one was rejected since the newest preamble.
+        unconfirmed: Frames since then, by count: another transmitter may send.
         missed: Frames that were due and skipped, by count.
         is_behind: Frames that are due wait for the next step.
         last_tried: Number of the newest frame on the grid that was skipped as soon as it was due.
@@ -285,11 +281,11 @@ class Transmitters:
         step_us: int,
         limits: Limits,
         numbers: Iterator[int],
-        chips_after: int,
+        trailing_chips: int,
     ) -> None:
         self._packet = packet
         self._lookback_us = LOOKBACK_PACKETS * packet.packet_chips * packet.chip_us
-        self._chips_after = chips_after
+        self._trailing_chips = trailing_chips
         self._max_remembered = limits.remembered
         self._step_us = step_us
         self.alive: dict[int, Transmitter] = {}
@@ -350,13 +346,12 @@ class Transmitters:
         return False
 
     def _new_grid(self) -> PacketGrid:
-        return PacketGrid(self._packet, self._chips_after)
+        return PacketGrid(self._packet, self._trailing_chips)
 
     def find_in_step(self, transmitter: Transmitter) -> list[Transmitter]:
         """Find others without a frame so far whose packets are at the found times.
 
-        They are parts of one bar, or a bar and its image: of two bars, three in a hundred pairs would be in
-        step.
+        They are parts of one bar, or a bar and its image: of two bars, 3 % of pairs would be in step.
         """
         lock = transmitter.grid.lock
         if lock is None or transmitter.region.size_px is not None:

@@ -18,8 +18,8 @@ _STRIDE = 16
 def count_bins(t_us: Array, p: Array, where: tuple[int, float, int], known: Array, counts: Array) -> None:
     """Add events to `known` counts, by polarity (row) and time (column).
 
-    `where` holds the number of the first column, the length of each, us, and how many of the known ones are
-    before it.
+    `where` holds the number of the first column, the length of each, us, and how many known ones are before
+    it.
     """
     first_bin, bin_us, skipped = where
     bins = counts.shape[1]

@@ -21,12 +21,11 @@ _PACKETS = 256
 fewer these are, the further it is from what is likely to what is possible."""
 
 _RARE_SHARE = 3e-4
-"""Share of all chips at which other codes may reach it: in one of ten packets; a preamble that fits better
-takes over at once."""
+"""Share of all chips at which other codes may reach it: in one of ten packets; a better preamble takes over
+at once."""
 
 _SIDELOBE_CHIPS = 3
-"""Distance up to which a peak is the preamble's own: pair codes have high sidelobes one and two chips
-away."""
+"""Distance up to which a peak is the preamble's own: pair codes have high sidelobes up to two chips away."""
 
 
 def due_chips(preamble: NDArray[np.uint8]) -> NDArray[np.bool_]:
@@ -85,8 +84,7 @@ def guard_chips(preamble: NDArray[np.uint8], least: float) -> int:
     """Within how many chips of a preamble what correlates by `least` is not another one, but its own shift.
 
     Three at the least, and as many for a pair code. Shifts of other codes may agree in many of the edges that
-    are left, those of sparse pulses above all: as far as they do, on pixels that answer at once, with dark
-    before and behind.
+    are left, those of sparse pulses above all: as far as they do, on pixels that answer at once.
 
     >>> from evlcp_sdk.air.codebook import BARKER13, chips_of_values
     >>> pulses = np.kron(np.array(BARKER13) > 0, [1, 0, 0]).astype(np.uint8)

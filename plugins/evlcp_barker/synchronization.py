@@ -231,7 +231,6 @@ class BarkerSynchronizer:
         return SyncState(first_bin, counts, first_bin + lo, power, known, clock, stray), locks
 
     def _refine_peak(self, peak: _Peak) -> _Preamble:
-        """Times of a peak's preamble, for positive and negative events apart, us."""
         first_bin, counts, lag, quality = peak
         (off, off_noise), (on, on_noise) = self._fit_polarities(counts, lag)
         response = counts[1].take(lag + self._rise_steps, mode="clip")
@@ -252,8 +251,7 @@ class BarkerSynchronizer:
     def _fit_polarities(self, counts: Floats, lag: int) -> list[tuple[float, float]]:
         """Where near a lag negative events fit a preamble best, and positive ones; NaN where none do.
 
-        In steps, each with its variance by the results without each pair of chips, as pair codes are made of,
-        or without each chip.
+        In steps, each with its variance by the jackknife over chips, or over pairs of them in pair codes.
         """
         first, last = max(lag - _CHIP_STEPS, 0), min(lag + _CHIP_STEPS + 1, counts.shape[1] - self._span + 1)
         running = np.zeros((2, last - first + self._span))
@@ -304,7 +302,6 @@ class BarkerSynchronizer:
         return packets > 0 and off_us < (chips + _ON_GRID_CHIPS) * self._packet.chip_us
 
     def _max_drift_us(self) -> float:
-        """How much longer or shorter than nominal a packet may be."""
         return self._spec.clock_tolerance_ppm * 1e-6 * self._packet.packet_chips * self._packet.chip_us
 
     def _start_clock(self, found: _Preamble) -> _Clock:

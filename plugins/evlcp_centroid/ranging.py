@@ -23,7 +23,7 @@ class CentroidRanging(Ranging):
     Each cluster's centre is the mean of its map, whatever its LEDs. To a side where it has no neighbour it
     looks larger than it is: those count that have neighbours on the same sides as most have. From a start by
     medians, clusters far from the fit, by more than three times the median, are left out. Sigma is that of
-    the least squares.
+    the fit.
     """
 
     skip_outer: Annotated[

@@ -42,8 +42,7 @@ HUBER_LIMIT = 0.5
 """Residual, in full values, beyond which a row weighs less: a cluster decoded wrong does not bend the fit."""
 
 PROFILE_REACH = 12.0
-"""Widths of a boundary's core up to which it has an effect: 6 of 100000 of tails thrice as wide are
-beyond."""
+"""Widths of a boundary's core up to which it has an effect: 6 of 100000 of tails are beyond."""
 
 ROUNDING_SHARE = 1e-8
 """Share of a diagonal that rounding may leave of 0."""
@@ -200,8 +199,7 @@ def read_rows(sums: Array, line: Array, clusters: int, out: Array) -> None:
     """Read the values of the rows of a bar, `out` (values, rows): of a value, the second chip's sums count.
 
     `line` (5,) is as from `fit_line`, in pixels, and half the width. Columns are weighted by their light
-    between the bar's ends; less than `_VEIL_SHARE` of the brightest column's is a veil, or outside of the
-    bar.
+    between the bar's ends; less than `_VEIL_SHARE` of the brightest column's is a veil, or not the bar's.
     """
     chips, rows, width = sums.shape
     one, other = line[0] - 0.5 * line[1], line[0] + (clusters - 0.5) * line[1]
@@ -252,8 +250,7 @@ def measure_dim(sums: Array, pilots: Array, seen: Array, line: Array) -> float:
     A camera may miss more events of one polarity, and boundaries then show values of that sign smaller. The
     number of events does not count: a fast step up gives few and a slow one down many, but a pixel at a
     boundary, which sees a small part of the step, gives one or none. The half spacing of rows about each
-    cluster's middle counts, in its pilot, which comes first; `line` is as for `read_rows`. 1 where nothing is
-    known.
+    cluster's middle counts, in its pilot, which comes first; `line` is as for `read_rows`. 1 if unknown.
     """
     _, rows, columns = sums.shape
     half, reach = int(line[4]), abs(line[1]) / 4
@@ -303,8 +300,7 @@ def list_steps(codes: Array, known: Array, motion: Array, reach: float, fit: Arr
     the pixels that are blind from them, make it look smaller; nothing is known of what came before a frame.
 
     Returns:
-        Steps, and their values (blocks, rows, `_BLOCK`), as many rows as the longest has. Unused steps have
-        no rows.
+        Steps, and their values (blocks, rows, `_BLOCK`), as many rows as the longest has; others have fewer.
     """
     clusters, n = codes.shape
     rows, half = values.shape[1], min(reach, fit[0] / 2)
@@ -351,8 +347,7 @@ def _model_levels(
 ) -> None:
     """Levels of each step in a row, counted from its first, for a gain of 1, and their slopes.
 
-    In the first row it sets how far that is beyond the boundary. By linear interpolation of the profile;
-    `lens` as for `fit_bar`.
+    In the first row it sets how far that is beyond the boundary; `lens` is as for `fit_bar`.
     """
     if row == 0:
         for j in range(_BLOCK):
@@ -586,8 +581,7 @@ def solve_fit(
 def estimate_motion(shift: Array, information: Array, when: Array, out: Array) -> None:
     """Estimate from each value's shift the motion beyond a steady drift, as far as it exceeds noise.
 
-    The shifts' variance beyond that of noise weighs each against no motion (empirical Bayes). `out` may be
-    `shift`.
+    The shifts' variance beyond that of noise weighs each (empirical Bayes). `out` may be `shift`.
     """
     total, sum_shift, sum_when = 0.0, 0.0, 0.0
     for i in range(shift.size):
@@ -617,8 +611,7 @@ def assess_fit(by_boundary: Array, scores: Array, normal: Array) -> tuple[float,
     It is the mean of two: by rows as observations (sandwich estimator), and by the scatter of the boundaries.
 
     Returns:
-        The variance; the number of boundaries; and by how much a pixel-phase bias of 1 px makes the spacing
-        larger, px.
+        The variance; the number of boundaries; and what a pixel-phase bias of 1 px adds to the spacing, px.
     """
     inverse, scale, unit = np.empty(PARAMETERS), np.empty(PARAMETERS), np.zeros(PARAMETERS)
     factor = np.empty((PARAMETERS, PARAMETERS))

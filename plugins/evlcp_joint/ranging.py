@@ -42,18 +42,16 @@ class JointScaleRanging(Ranging):
     zero at the boundary with a slope: that gives the place of the boundary to a fraction of a pixel. All rows
     and values are fitted by one straight scale. Rows beyond the middles of the outermost clusters, where
     there is no neighbour, are left out, so that an outer edge cannot bias it. The rest of the motion within
-    the frame is known from the track, its rate is fitted, and what is neither is found value by value, as far
-    as it exceeds the noise.
+    the frame is known from the track, its rate is fitted, and the rest is found value by value.
 
     Positive and negative events are not alike in number and time, and an edge leaves late events and blind
     pixels to the next one a chip later. Both shift boundaries, by up to a twentieth of a pixel: those that
     step up to one side and those that step down to the other, and into the cluster that repeats a value. As
-    pilots are the same in every frame, the scale and the curvature would be off; so both shifts are fitted,
-    too.
+    pilots are the same in every frame, scale and curvature would be off; so both are fitted, too.
 
     Cells out of line with the layout, boundaries out of line with the others, and info values of clusters
-    whose symbol is not known are left out. There is no distance where the fit leaves the cells, or does not
-    explain the values.
+    whose symbol is not known are left out. There is no distance if the fit leaves the cells or explains too
+    little.
 
     The pilots have to be pair codes. In a frame with other codewords, only the pilot is used.
 
@@ -103,7 +101,6 @@ class JointScaleRanging(Ranging):
     def _compile_column(
         self, camera: CameraModel, codebook: Codebook, column: NDArray[np.int64], spacing_m: float
     ) -> Measure:
-        """Precompute for one column, measured by the views of its clusters alone."""
         clusters, least = len(column), min(self.min_boundaries, len(column) - 1)
         pilots = codebook.pilot_values[column].astype(np.float64)
         words = codebook.codeword_values.astype(np.float64)
@@ -196,7 +193,6 @@ def boundary_profile(core_share: float) -> Floats:
 
 
 def _select_column(view: FrameView, clusters: NDArray[np.int64]) -> FrameView:
-    """The view of some of the clusters, in this order."""
     presence, soft = view.presence, view.soft
     return replace_fields(
         view,
@@ -223,7 +219,6 @@ def _average_columns(parts: Sequence[Range]) -> Range:
 
 
 def _suggest_ranging(bar: BarLayout, codebook: Codebook) -> str:
-    """The ranging for a layout that this one refuses, if any is."""
     if bar.clusters < 2:
         return "no ranging measures the distance of one cluster: use 'none' for this layout"
     return f"use '{ROLES['ranging'].default_for(bar, codebook.unpaired_codes)}' for this layout"

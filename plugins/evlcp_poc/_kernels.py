@@ -19,7 +19,7 @@ def find_middles(maps: Array, apart_m: Array, min_pixels: int, out: Array) -> tu
 
     Returns:
         The scale that all clusters agree on, px a metre, by their distances `apart_m` (K, K): the median of
-        the farther half of pairs, 0 without any; how far from their middles maps are lit, down or up and to a
+        the farther half of pairs, 0 without any; how far from their middles maps are lit, vertically and to a
         side.
     """
     clusters, height, width = maps.shape
@@ -198,8 +198,7 @@ def mean_distance(
     `pairs` are first and second cluster, and spacing, m; images are as far apart as middles (K, 2) of maps,
     and `beyond_px` (pairs, 2). `places` are the scale of all clusters, px a metre; by how much, m, pairs may
     differ from the distance that it gives; and how many must not. `rules` are the power of a spacing that
-    weights it, how many are dropped at each end, and interquartile ranges beyond the quartiles for an
-    outlier.
+    weights it, how many are dropped at each end, and the outliers' interquartile ranges.
 
     Returns:
         (mean, sigma, values kept), NaN and 0 of too few; sigma is NaN if no two clusters can be left out.

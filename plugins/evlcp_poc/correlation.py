@@ -12,8 +12,7 @@ _MIN_AMPLITUDE = 1e-5
 
 _BAND_CYCLES = 0.5
 """End of the band that blobs fill, cycles a blob size: half the main lobe of a box's spectrum, where its
-amplitude is still 2 / pi of the peak. The noise of a phase is inverse to the amplitude, and all phases weigh
-the same."""
+amplitude is still 2 / pi of the peak. The noise of a phase is inverse to its amplitude."""
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -18,8 +18,7 @@ def _fork_paths(metric: Array, penalty: Array, limit: float, alive: Array, rows:
     """Continue each path by bit 0 and bit 1, and keep the best that have room; return how many.
 
     `penalty` (2, size) is what the bits add to the metric. Where both continuations of a path stay, that by 1
-    gets a free row, and shares `rows`; `fork` (2, size) takes which path each row continues, and by which
-    bit.
+    gets a free row, and shares `rows`; `fork` (2, size) takes the path each row continues, and the bit.
     """
     size, origin, bit = len(metric), fork[0], fork[1]
     cost, which = np.empty(2 * size), np.empty(2 * size, np.int64)
@@ -137,8 +136,7 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
 
     Tal and Vardy (2015), by LLRs and min-sum (Balatsoukas-Stimming et al. 2015): the metric of a whole path
     is the total of |llr| where its codeword differs from the sign of the LLR, and only grows along the path.
-    Nodes whose inputs are all 0, or all but the last, or all free, are decided at once (Hashemi et al. 2016),
-    with the same result.
+    Nodes whose inputs are all 0, or all but the last, or all free, are decided at once (Hashemi et al. 2016).
 
     Args:
         llr: LLRs of the N code bits, float32.

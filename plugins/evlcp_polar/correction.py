@@ -68,8 +68,7 @@ class Polar(ErrorCorrection):
         """Choose the code's inputs and the bits that are sent.
 
         Raises:
-            ConfigError: A codeword has no room for a byte beside the CRC, or for what a plausible one has
-                beyond its message.
+            ConfigError: A codeword has no room for a byte beside the CRC, or for more than its message.
         """
         words = max(-(-coded_bits // _MAX_BITS), 1)
         length = coded_bits // words

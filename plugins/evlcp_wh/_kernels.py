@@ -398,8 +398,7 @@ def find_path(matches: Array, known: Array, step_cost: float, place_cost: float,
 
     `matches` are (K, n, n, values), `known` the codes of the first values, (K, ...); of the others, each
     cluster's is the one that fits better. A shift costs its square times `place_cost`, a change from value to
-    value its square times `step_cost`. Squares add, so the best predecessor is sought along one axis, then
-    along the other.
+    value its square times `step_cost`. Squares add, so the best predecessor is sought axis by axis.
     """
     clusters, side, _, values = matches.shape
     first, half = known.shape[1], side // 2

@@ -11,8 +11,7 @@ from evlcp_sdk.values import PresenceMap, SoftSymbols, to_kernel_array
 from evlcp_wh import _kernels
 
 _MIN_WEIGHT, _MIN_SOFT_WEIGHT = 0.01, 0.05
-"""Presence probability below which a cell is left out by `wh-transform`, and by the others: it adds nothing
-but time."""
+"""Presence probability below which a cell is left out by `wh-transform`, and by others: it only adds time."""
 
 MAX_EVENTS = 3
 """Polarity sums beyond this many events count as this many: more are too rare to learn."""

@@ -17,8 +17,7 @@ from evlcp_wh.decoding import INDEPENDENT_PIXELS, MlDecoder
 from evlcp_wh.separation import CellPosterior
 
 _UNSURE_LLR = 2.0
-"""Log-likelihood ratio of a bit below which a bar that moved is sought farther: one such bit in eight is
-wrong."""
+"""Log-likelihood ratio of a bit below which motion is sought farther: one such bit in eight is wrong."""
 
 _SURE_LLR = 20.0
 """Log-likelihood ratio of every bit from which on a frame is decoded once only."""
@@ -44,7 +43,7 @@ class MotionFeedback(Decoding):
     likeliest smooth path over all values (Viterbi) is removed from the sums, the clusters are separated again
     by their pilots, and their info segments decoded. A frame whose path stays at 0 is decoded as by
     `ml-soft`; one whose path comes within a pixel of the border of what is searched, or leaves a bit unsure,
-    is searched farther.
+    is sought farther.
 
     A path that started from decisions alone would confirm a wrong one: a bar off by the spacing of its
     clusters decodes to its neighbours' symbols without a fault.
@@ -126,8 +125,7 @@ def match_shifts(
 def find_path(matches: NDArray[np.float32], known: NDArray[np.int8]) -> NDArray[np.int64]:
     """Find the shift (down, right) of the bar from its place in each value, int64 (values, 2), px.
 
-    `known` are the codes of the first n values, (K, n); of the others, each cluster's is the one that fits
-    better.
+    `known` are the codes of the first n values, (K, n); of the others, the better fit counts.
     """
     values = matches.shape[3]
     path = np.empty((values, 2), np.int64)

@@ -72,7 +72,7 @@ def test_frames_are_due_as_they_are_on_air(form, heard, earliest_us, until_us):
 @pytest.mark.parametrize("after", [0, 1])
 def test_the_events_after_the_last_edge_are_waited_for(form, after):
     """And the chips after it that are read with it."""
-    grid = PacketGrid(form, chips_after=after)
+    grid = PacketGrid(form, trailing_chips=after)
     assert grid.next is None
     grid.restart(lock_of(form, 0, delay_us=35.0), ZERO_US)
     _, _, start_us, end_us = on_air(form, 1)[0]
