@@ -1,4 +1,4 @@
-"""What the `evlcp` command line consists of, plugins' commands included."""
+"""The `evlcp` command line, with the commands of plugins."""
 
 import importlib
 import re
@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperGroup
 from typer.models import CommandInfo
 
-from evlcp_sdk.cli._common import echo, hush, log_on_stderr
+from evlcp_sdk.cli._common import echo, log_on_stderr, silence_matplotlib
 from evlcp_sdk.printable import escape_controls
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ Exit codes: [bold]0[/] done, also without a transmitter; [bold]1[/] failed; [bol
 """
 
 
-_OWN = (
+_BUILT_IN = (
     "receive",
     "live",
     "serve",
@@ -51,67 +51,67 @@ _OWN = (
     "check",
     "warm_up",
 )
-"""Modules of our own commands, each of which has the one that it is named after."""
+"""Modules of the built-in commands, each with the function of its name."""
 
-_WRAPPED = re.compile(r"(?<!\n)\n(?!\n|[A-Z][^\n:\[]+:\s+\[bold\])")
-"""Where a help text goes on in the next line, which Typer keeps: no paragraph or example ends."""
+_LINE_BREAK = re.compile(r"(?<!\n)\n(?!\n|[A-Z][^\n:\[]+:\s+\[bold\])")
+"""Line breaks of a help text, which Typer keeps, within a paragraph or example."""
 
 
 class _Commands(TyperGroup):
-    """The commands; what Typer says of a wrong command line repeats it, and moves no cursor either."""
+    """The commands; Typer's messages, which repeat a wrong command line, are escaped."""
 
     def make_context(self, *args: Any, **more: Any) -> Any:
-        with _printable_faults():
+        with _escape_messages():
             return super().make_context(*args, **more)
 
     def invoke(self, ctx: Any) -> Any:
-        with _printable_faults():
+        with _escape_messages():
             return super().invoke(ctx)
 
 
 def _parse_once(command: Any, parse: Callable[..., Any], ctx: Any, args: list[str]) -> Any:
-    """Refuse an option that takes one value and is given two, of which all but the last would be ignored."""
+    """Refuse an option that takes one value and is given twice; Typer would take the last."""
     try:
         _, _, order = command.make_parser(ctx).parse_args(list(args))
     except Exception:
-        # The command itself says what is wrong with them.
+        # The command itself reports what is wrong.
         return parse(ctx, args)
     for option in order:
-        many = option.param_type_name != "option" or option.multiple or option.is_flag or option.count
-        if not many and order.count(option) > 1:
-            said = f"{option.opts[-1]} is given {order.count(option)} times, expected once"
+        repeats = option.param_type_name != "option" or option.multiple or option.is_flag or option.count
+        if not repeats and order.count(option) > 1:
+            message = f"{option.opts[-1]} is given {order.count(option)} times, expected once"
             if "--config" in option.opts:
-                said += f": {ctx.info_name} goes by one link; run it once for each"
-            ctx.fail(said)
+                message += f": {ctx.info_name} goes by one link; run it once for each"
+            ctx.fail(message)
     return parse(ctx, args)
 
 
 @contextmanager
-def _printable_faults() -> Iterator[None]:
-    """Have those exceptions say it in printable words that Typer itself shows."""
+def _escape_messages() -> Iterator[None]:
+    """Escape control characters in the messages of exceptions that Typer prints."""
     try:
         yield
     except Exception as fault:
-        words = getattr(fault, "format_message", None)
-        if words is not None:
-            said = escape_controls(words())
-            fault.format_message = lambda: said  # type: ignore[attr-defined]
+        format_message = getattr(fault, "format_message", None)
+        if format_message is not None:
+            message = escape_controls(format_message())
+            fault.format_message = lambda: message  # type: ignore[attr-defined]
         raise
 
 
-def _finish(command: Any) -> None:
-    """Have a command, and those of a group, wrap its help as the screen is wide, and take options once."""
+def _prepare_command(command: Any) -> None:
+    """Let a command, and those of a group, wrap its help to the screen, and refuse repeated options."""
     for nested in getattr(command, "commands", {}).values():
-        _finish(nested)
-    command.help = _WRAPPED.sub(" ", cleandoc(command.help or ""))
+        _prepare_command(nested)
+    command.help = _LINE_BREAK.sub(" ", cleandoc(command.help or ""))
     command.parse_args = partial(_parse_once, command, command.parse_args)
 
 
 def make_app(*modules: str) -> typer.Typer:
-    """The command line with its own commands; plugins add theirs by `evlcp_register_commands`.
+    """The command line with the built-in commands; plugins add theirs by `evlcp_register_commands`.
 
     Args:
-        modules: Of these of `_OWN` alone; none for all.
+        modules: Names of `_BUILT_IN` to take; none for all.
     """
     app = typer.Typer(
         name="evlcp",
@@ -122,56 +122,56 @@ def make_app(*modules: str) -> typer.Typer:
         help=HELP,
     )
     app.callback()(_root)
-    for module in modules or _OWN:
+    for module in modules or _BUILT_IN:
         command = getattr(importlib.import_module(f"evlcp_sdk.cli.{module}"), module)
         app.command(module.replace("_", "-"))(command)
     return app
 
 
 def add_plugin_commands(app: typer.Typer, registry: "Registry") -> None:
-    """Add the commands of plugins; a plugin whose commands cannot be built, or are there, is left out."""
-    known = _names(app)
+    """Add the commands of plugins; a plugin whose commands cannot be built, or exist already, is left out."""
+    known = _command_names(app)
     for plugin in registry.plugins_with_hook("evlcp_register_commands"):
         added = typer.Typer()
         for _ in registry.call_hook("evlcp_register_commands", only=plugin, app=added):
             reason = None
             if registry.distribution_of(plugin)[0] != "evlcp-sdk":
-                # Ours are built in any case, and tested.
-                reason = _fault_of(added, known)
+                # The SDK's own are tested.
+                reason = _find_fault(added, known)
             if reason is not None:
                 registry.leave_out(plugin, reason)
                 continue
-            known |= _names(added)
+            known |= _command_names(added)
             app.registered_commands += added.registered_commands
             app.registered_groups += added.registered_groups
 
 
-def _names(app: typer.Typer) -> set[str]:
-    """Names of its commands and groups, as they are called."""
-    named = {_name(command) for command in app.registered_commands}
-    return named | {group.name or "" for group in app.registered_groups}
+def _command_names(app: typer.Typer) -> set[str]:
+    """Names of an app's commands and groups."""
+    commands = {_command_name(command) for command in app.registered_commands}
+    return commands | {group.name or "" for group in app.registered_groups}
 
 
-def _name(command: CommandInfo) -> str:
-    """How a command is called, as Typer has it."""
+def _command_name(command: CommandInfo) -> str:
+    """The name that Typer gives a command."""
     return command.name or str(getattr(command.callback, "__name__", "")).lower().replace("_", "-")
 
 
-def _fault_of(added: typer.Typer, known: set[str]) -> str | None:
-    """What is wrong with the commands of a plugin, in one line."""
+def _find_fault(added: typer.Typer, known: set[str]) -> str | None:
+    """Why the commands of a plugin cannot be added, in one line; None where they can."""
     if not (added.registered_commands or added.registered_groups):
         return None
-    # With a callback, a single command is built as one of a group, too.
+    # With a callback, a single command is built as a group, too.
     added.callback()(lambda: None)
     try:
         typer.main.get_command(added)
     except Exception as fault:
         return f"its commands cannot be built: {type(fault).__name__}: {' '.join(str(fault).split())}"
-    twice = sorted(known & _names(added))
-    return f"has the command '{twice[0]}', which is there already" if twice else None
+    duplicates = sorted(known & _command_names(added))
+    return f"has the command '{duplicates[0]}', which is there already" if duplicates else None
 
 
-def _version(show: bool) -> None:
+def _print_version(show: bool) -> None:
     if show:
         from importlib.metadata import version
 
@@ -181,7 +181,8 @@ def _version(show: bool) -> None:
 
 def _root(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end."),
     ] = False,
 ) -> None:
     del version
@@ -191,33 +192,33 @@ def run() -> None:
     """Parse the command line and run its command; a `PluginWarning` becomes a line on stderr.
 
     Raises:
-        EvlcpError: What the command raises.
+        EvlcpError: The command has failed.
         SystemExit: The command has ended.
     """
     import warnings
 
-    from evlcp_sdk.cli._complain import complain
+    from evlcp_sdk.cli._stderr import print_stderr
     from evlcp_sdk.errors import PluginWarning
 
-    others = warnings.showwarning
-    said = set()
+    show_other = warnings.showwarning
+    shown = set()
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
         if issubclass(category, PluginWarning):
-            # Every registry of the process finds it again.
-            if str(message) not in said:
-                complain(f"warning: {message}")
-            said.add(str(message))
+            # Every registry of the process repeats it.
+            if str(message) not in shown:
+                print_stderr(f"warning: {message}")
+            shown.add(str(message))
         else:
-            others(message, category, *place, **more)
+            show_other(message, category, *place, **more)
 
     with warnings.catch_warnings(), log_on_stderr():
         warnings.simplefilter("always", PluginWarning)
         warnings.showwarning = show
-        hush()
+        silence_matplotlib()
         module = "".join(sys.argv[1:2]).replace("-", "_")
-        if module in _OWN and module != "plugins":
-            # It needs neither others nor a plugin's, and would wait for these a tenth of its start.
+        if module in _BUILT_IN and module != "plugins":
+            # Neither other commands nor plugins are needed, which take a tenth of a start.
             app = make_app(module)
         else:
             from evlcp_sdk.plugin.registry import Registry
@@ -225,5 +226,5 @@ def run() -> None:
             app = make_app()
             add_plugin_commands(app, Registry.load())
         group = typer.main.get_group(app)
-        _finish(group)
+        _prepare_command(group)
         group()

@@ -1,31 +1,31 @@
-"""How a campaign is shown while it runs: a bar, and the jobs that failed."""
+"""The display of a running campaign: a bar, and the failed jobs."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from evlcp_sdk.cli._common import progress_bar
-from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.cli._stderr import print_stderr
 
 if TYPE_CHECKING:
     from evlcp_sdk.study.collect import Progress
 
-_MOST_FAULTS = 5
+_MAX_FAULTS = 5
 
 
-def show_faults(progress: "Progress") -> None:
-    """Say which jobs failed, one line each, equal faults once."""
+def print_faults(progress: "Progress") -> None:
+    """Print the failed jobs, one line for equal faults."""
     lines = dict.fromkeys(fault.message for _, fault in progress.faults)
-    for line in list(lines)[:_MOST_FAULTS]:
+    for line in list(lines)[:_MAX_FAULTS]:
         number = sum(fault.message == line for _, fault in progress.faults)
-        complain(f"{number} job{'s' * (number > 1)} failed: {line}")
-    if len(lines) > _MOST_FAULTS:
-        complain(f"{len(lines) - _MOST_FAULTS} more kinds of failure")
+        print_stderr(f"{number} job{'s' * (number > 1)} failed: {line}")
+    if len(lines) > _MAX_FAULTS:
+        print_stderr(f"{len(lines) - _MAX_FAULTS} more kinds of failure")
 
 
 @contextmanager
 def campaign_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
-    """A bar by tasks, with the errors so far, on a terminal only."""
+    """A bar by tasks, with the errors so far; on a terminal only."""
     with progress_bar(name) as advance:
 
         def show(progress: "Progress") -> None:

@@ -1,4 +1,4 @@
-"""Functions as commands, whose parameters may be groups of options, and whose rare ones help leaves out."""
+"""Functions as commands: parameters may be groups of options, and help may hide rare options."""
 
 import inspect
 from collections.abc import Callable
@@ -11,9 +11,9 @@ import typer
 from evlcp_sdk.cli._common import echo
 
 
-def _show_all(ctx: typer.Context, asked: bool) -> None:
+def _show_full_help(ctx: typer.Context, show: bool) -> None:
     """Show a command's help with its hidden options, and end."""
-    if not asked:
+    if not show:
         return
     for parameter in ctx.command.params:
         parameter.hidden = False  # type: ignore[attr-defined]
@@ -22,14 +22,14 @@ def _show_all(ctx: typer.Context, asked: bool) -> None:
 
 
 _HelpAll = Annotated[
-    bool, typer.Option("--help-all", callback=_show_all, is_eager=True, help="Show rarer options, too.")
+    bool, typer.Option("--help-all", callback=_show_full_help, is_eager=True, help="Show rarer options, too.")
 ]
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
-    """A function as a command for Typer: of each parameter that is a dataclass, every field is an option.
+    """Make a function a command for Typer, with an option for every field of a parameter that is a dataclass.
 
-    Help shows those of a dataclass with a `PANEL` under that title, and hidden ones with `--help-all`.
+    Help shows options of a dataclass with a `PANEL` under that title, and hidden ones with `--help-all`.
 
     >>> from dataclasses import dataclass
     >>> @dataclass(frozen=True)
@@ -50,13 +50,13 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             continue
         assert isinstance(kind, type)
         groups[parameter.name] = kind
-        of_field = get_type_hints(kind, include_extras=True)
+        field_hints = get_type_hints(kind, include_extras=True)
         for f in fields(kind):
-            for info in getattr(of_field[f.name], "__metadata__", ()):
+            for info in getattr(field_hints[f.name], "__metadata__", ()):
                 info.rich_help_panel = getattr(kind, "PANEL", None)
             options.append(
                 inspect.Parameter(
-                    f.name, parameter.KEYWORD_ONLY, default=f.default, annotation=of_field[f.name]
+                    f.name, parameter.KEYWORD_ONLY, default=f.default, annotation=field_hints[f.name]
                 )
             )
     infos = [info for one in options for info in getattr(one.annotation, "__metadata__", ())]

@@ -1,4 +1,4 @@
-"""What the commands share: their options, where jobs run, what goes to stderr."""
+"""Shared by the commands: options, executors of jobs, and the terminal."""
 
 import json
 import logging
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.printable import escape_controls
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ Dask = Annotated[
 
 
 def echo(text: str, *, nl: bool = True) -> None:
-    """Print a text on stdout; what it has of names and texts from outside moves no cursor."""
+    """Print a text on stdout, its control characters escaped."""
     typer.echo(escape_controls(text), nl=nl)
 
 
@@ -58,57 +58,56 @@ def print_json(value: object, indent: int | None = None) -> None:
     echo(json.dumps(value, indent=indent))
 
 
-class _Complaints(logging.Handler):
-    """Says on stderr what the SDK writes to its log."""
+class _StderrHandler(logging.Handler):
+    """Prints the SDK's log on stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        complain(record.getMessage())
+        print_stderr(record.getMessage())
 
 
 @contextmanager
 def log_on_stderr() -> "Iterator[None]":
-    """Say on stderr what the SDK has to say while it works: that kernels are compiled."""
-    log, handler = logging.getLogger("evlcp_sdk"), _Complaints(logging.INFO)
-    before = log.level
+    """Print the SDK's log on stderr, such as the progress of compiling kernels."""
+    log, handler = logging.getLogger("evlcp_sdk"), _StderrHandler(logging.INFO)
+    previous_level = log.level
     log.setLevel(logging.INFO)
     log.addHandler(handler)
     try:
         yield
     finally:
         log.removeHandler(handler)
-        log.setLevel(before)
+        log.setLevel(previous_level)
 
 
-def hush() -> None:
-    """Keep Matplotlib from saying on stderr where it keeps its caches when there is no home."""
+def silence_matplotlib() -> None:
+    """Keep Matplotlib from reporting the place of its caches on stderr when there is no home."""
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
 def console(*, stderr: bool = False) -> "Console":
-    """Where tables go: stdout, without colour where it is not a terminal or NO_COLOR is set; bars to stderr.
+    """A console of Rich on stdout or stderr, without colour unless on a terminal and without NO_COLOR.
 
-    Texts are printed as they are: no brackets of a name or a plugin are taken for Rich's markup, and no
-    control characters for the terminal's.
+    Texts are printed as they are, without markup and with escaped control characters.
     """
     from rich.console import Console
     from rich.segment import Segment
 
-    made = Console(highlight=False, soft_wrap=True, markup=False, emoji=False, stderr=stderr)
-    rendered = made.render
+    screen = Console(highlight=False, soft_wrap=True, markup=False, emoji=False, stderr=stderr)
+    render_raw = screen.render
 
     def render(renderable: "RenderableType", options: "ConsoleOptions | None" = None) -> "Iterator[Segment]":
-        for text, style, control in rendered(renderable, options):
+        for text, style, control in render_raw(renderable, options):
             yield Segment(text if control else escape_controls(text), style, control)
 
-    made.render = render  # type: ignore[method-assign]
-    return made
+    screen.render = render  # type: ignore[method-assign]
+    return screen
 
 
 def make_executor(workers: int | None, dask: str | None) -> "Executor":
-    """Where jobs run: on a cluster, in processes (None: one per core), or in this one for 0.
+    """An executor on a Dask cluster, in processes (None: one per core), or in this one for 0.
 
     Raises:
-        ConfigError: The cluster is not there.
+        ConfigError: The cluster cannot be reached.
     """
     if dask is not None:
         if workers is not None:
@@ -125,16 +124,16 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
     return Processes(workers or os.cpu_count() or 1)
 
 
-def shows_bars() -> bool:
-    """Whether stderr may be a terminal for Rich, which takes a while to load."""
-    told = os.environ.get("FORCE_COLOR") or os.environ.get("TTY_COMPATIBLE")
-    return bool(told) or (sys.stderr is not None and sys.stderr.isatty())
+def can_show_bars() -> bool:
+    """Whether stderr may be a terminal; asked before Rich, which loads slowly, is imported."""
+    forced = os.environ.get("FORCE_COLOR") or os.environ.get("TTY_COMPATIBLE")
+    return bool(forced) or (sys.stderr is not None and sys.stderr.isatty())
 
 
 @contextmanager
 def progress_bar(name: str, *, by_bytes: bool = False) -> "Iterator[Callable[..., None]]":
-    """A bar on stderr, on a terminal only: a function of what is done, of how much, and words beside it."""
-    if not shows_bars():
+    """A bar on stderr, on a terminal only; gives a function of the amount done, the total, and a text."""
+    if not can_show_bars():
         yield lambda _done, _total, _words="": None
         return
     from rich import progress
@@ -153,5 +152,5 @@ def progress_bar(name: str, *, by_bytes: bool = False) -> "Iterator[Callable[...
 
 
 def bytes_bar(name: str) -> "AbstractContextManager[Advance]":
-    """A bar by bytes read, or by time where there is no size."""
+    """A bar by bytes read, or by time where the size is unknown."""
     return progress_bar(name, by_bytes=True)

@@ -1,4 +1,4 @@
-"""What `receive`, `live` and `survey` read from their options."""
+"""Groups of options of `receive`, `live` and `survey`."""
 
 import os
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import typer
 
 from evlcp_sdk.cli._common import LinkFiles, Overrides, echo
-from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.cli._stderr import print_stderr
 
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def parse_utc(text: str) -> datetime:
-    """A time in ISO 8601, UTC unless it says otherwise."""
+    """Parse a time in ISO 8601, UTC unless it has another zone."""
     try:
         time = datetime.fromisoformat(text)
     except ValueError as fault:
@@ -41,7 +41,7 @@ class LinkOptions:
     overrides: Overrides = None
 
     def load(self, registry: "Registry") -> "tuple[Link, ...]":
-        """The links; says on stderr, before anything is read, which of them a receiver cannot tell apart."""
+        """Load the links; warn on stderr of those that a receiver cannot distinguish."""
         from evlcp_sdk.link.several import load_links, name_links
 
         links = load_links(self.link_files, self.overrides or [], registry)
@@ -49,13 +49,13 @@ class LinkOptions:
             from evlcp_sdk.diagnosis.light_checks import find_alike_links
 
             for warning in find_alike_links(name_links(links)):
-                complain(f"warning: {warning}")
+                print_stderr(f"warning: {warning}")
         return links
 
 
 @dataclass(frozen=True)
 class ResultOptions:
-    """Where results go, and formats beside the usual ones."""
+    """The folder and the formats of results."""
 
     PANEL: ClassVar[str] = "Results"
 
@@ -81,34 +81,34 @@ class ResultOptions:
         typer.Option("--sink", metavar="NAME", help="Also write this format, e.g. mcap; repeat it."),
     ] = None
 
-    def lines(self, recordings: Sequence[str]) -> "LinePrinter | None":
-        """What prints lines as they come; None where nobody asked."""
+    def make_line_printer(self, recordings: Sequence[str]) -> "LinePrinter | None":
+        """A printer of lines of JSON as they come; None without `--json-lines`."""
         from evlcp_sdk.io.open import STDIN
 
         if self.json_lines is None:
             return None
-        for wrong, why in (
+        for is_wrong, reason in (
             (self.json_lines != STDIN, f"{self.json_lines}: expected -, standard output"),
             (self.as_json, "end with the summary: give one of --json and --json-lines"),
             (len(recordings) > 1, "are those of one recording"),
         ):
-            if wrong:
-                raise typer.BadParameter(why, param_hint="--json-lines")
+            if is_wrong:
+                raise typer.BadParameter(reason, param_hint="--json-lines")
         return LinePrinter()
 
-    def names(self, registry: "Registry", *, positions: bool) -> tuple[str, ...]:
-        """Names of what is asked for, those with an option of their own first; all can be loaded."""
+    def load_sink_names(self, registry: "Registry", *, positions: bool) -> tuple[str, ...]:
+        """Names of the sinks in use, those with options of their own first, after a check that all load."""
         from evlcp_sdk.plugin.records import choose_sinks
         from evlcp_sdk.results.sinks import load_sinks
 
-        short = [name for name in ("figures", "report", "parquet", "mcap") if getattr(self, name)]
-        asked = tuple(dict.fromkeys([*short, *(self.sinks or [])]))
-        load_sinks(choose_sinks(registry, asked, positions=positions))
-        if asked and self.out is None:
+        own_options = [name for name in ("figures", "report", "parquet", "mcap") if getattr(self, name)]
+        names = tuple(dict.fromkeys([*own_options, *(self.sinks or [])]))
+        load_sinks(choose_sinks(registry, names, positions=positions))
+        if names and self.out is None:
             raise typer.BadParameter(
-                f"{', '.join(asked)} goes into a folder: give -o OUT", param_hint="--out"
+                f"{', '.join(names)} goes into a folder: give -o OUT", param_hint="--out"
             )
-        return asked
+        return names
 
 
 Cores = Annotated[
@@ -119,7 +119,7 @@ Cores = Annotated[
 
 @dataclass(frozen=True)
 class PlaceOptions:
-    """What places the camera: bars, its attitude over time, satellites, and UTC of its clock's 0."""
+    """Inputs of positions: bars, the camera's attitude over time, satellites, and UTC of its clock's 0."""
 
     PANEL: ClassVar[str] = "Positions"
 
@@ -151,10 +151,10 @@ class PlaceOptions:
     ] = None
 
     def plan(self, links: "Sequence[Link]", *, mcap: bool = False) -> "PositionPlan | None":
-        """What positions are computed from, of those of several links that allow it; None without sites."""
+        """The inputs of positions, for the links that allow them; None without sites."""
         if self.sites is None:
-            for name, given in (("--mcap", mcap), ("--gnss", self.gnss is not None)):
-                if given:
+            for name, is_given in (("--mcap", mcap), ("--gnss", self.gnss is not None)):
+                if is_given:
                     raise typer.BadParameter("needs --sites", param_hint=name)
             return None
         from evlcp_sdk.link.several import name_links, select_positioning_links
@@ -171,7 +171,7 @@ class PlaceOptions:
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """How the camera is turned, and what tells its clock."""
+    """The camera's attitude and clock."""
 
     PANEL: ClassVar[str] = "Positions"
 
@@ -223,14 +223,14 @@ class CameraOptions:
     ] = None
 
     def attitude(self, place: PlaceOptions) -> "Attitude | AttitudeLog | None":
-        """What is known of the camera's attitude; None for nothing."""
+        """The camera's known attitude; None where it is unknown."""
         import math
 
         from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 
         gravity_deg = self.gravity_sigma_deg
         if gravity_deg is None:
-            # An IMU's samples follow a camera that sways; angles by hand hold for a whole drive.
+            # An IMU's samples follow a swaying camera; angles by hand hold for a whole drive.
             gravity_deg = 0.5 if place.attitude_file is None else 0.1
         sigmas = gravity_deg, self.heading_sigma_deg, self.white_sigma_deg, self.time_sigma_us
         angles = heading, pitch, roll = self.heading_deg, self.pitch_deg, self.roll_deg
@@ -252,31 +252,31 @@ class CameraOptions:
         return Attitude(pitch, roll, heading, *sigmas) if pitch is not None and roll is not None else None
 
     def clock(self, place: PlaceOptions) -> "datetime | PulseClock | None":
-        """What says the UTC of a camera's clock: pulses of a recording, or its zero; None for nothing."""
+        """The UTC of a camera's clock: pulses of a recording, or that of its zero; None if unknown."""
         from evlcp_sdk.utc import PulseClock
 
         return place.clock_zero if self.pps is None else PulseClock(self.pps, place.clock_zero)
 
 
 class LinePrinter:
-    """Prints lines as they come, until whoever reads them has left, or standard output takes no more.
+    """Prints lines as they come, until their reader has left, or standard output fails.
 
     Attributes:
-        gone: It is so.
-        failed: It took no more, which was said: the exit code is 1.
+        closed: One of these has happened.
+        failed: Standard output has failed, which was reported: the exit code is 1.
     """
 
     def __init__(self) -> None:
-        self.gone = self.failed = False
+        self.closed = self.failed = False
 
     def __call__(self, line: str) -> None:
-        if self.gone:
+        if self.closed:
             return
         try:
             echo(line)
         except OSError as fault:
-            self.gone, self.failed = True, not isinstance(fault, BrokenPipeError)
+            self.closed, self.failed = True, not isinstance(fault, BrokenPipeError)
             if self.failed:
-                complain(f"standard output: {fault.strerror}")
-            # Or else the interpreter tries once more as it ends.
+                print_stderr(f"standard output: {fault.strerror}")
+            # Or else the interpreter tries again at its end.
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

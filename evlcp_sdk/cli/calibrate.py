@@ -56,12 +56,12 @@ def calibrate(
         recordings, bars, known, link, registry=registry, limit_px=limit_px, name=str(poses)
     )
     if as_json:
-        print_json(_table(found) | {"poses": len(known)})
+        print_json(_to_dict(found) | {"poses": len(known)})
     else:
-        console().print(_toml(found, len(known)))
+        console().print(_to_toml(found, len(known)))
 
 
-def _table(found: CalibrationResult) -> dict[str, Any]:
+def _to_dict(found: CalibrationResult) -> dict[str, Any]:
     return {
         "camera": {name: getattr(found.camera, name) for name in found.sigma},
         "sigma": dict(found.sigma),
@@ -73,7 +73,7 @@ def _table(found: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def _toml(found: CalibrationResult, poses: int) -> str:
+def _to_toml(found: CalibrationResult, poses: int) -> str:
     """The tables `[camera]` and `[camera_sigma]`; as comments what was not determined."""
     lines = [
         f"# {format_count(found.views, 'view')}, {format_count(found.points, 'point')},"

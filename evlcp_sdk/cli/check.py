@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _STYLES = {"ok": "green", "failed": "bold red", "skipped": "dim", "excused": "yellow"}
 
 _WIDTH = 18
-"""Of a law's name, where laws are shown as they are judged: the longest is `codewords-distinct`."""
+"""Of a law's name, where outcomes are printed as they come: the longest is `codewords-distinct`."""
 
 
 def check(
@@ -63,12 +63,11 @@ def check(
     if role is None:
         if excuses:
             raise ConfigError("--excuse: expected ROLE and ID, whose law it is")
-        found = _check_link(link_file, overrides or [], as_json=as_json)
+        name, table = _check_link(link_file, overrides or [], as_json=as_json)
     elif id is None:
         raise ConfigError(f"check {role}: expected ROLE and ID, or neither for a whole link")
     else:
-        found = _check_one(role, id, link_file, overrides or [], excuses or [], as_json=as_json)
-    name, table = found
+        name, table = _check_algorithm(role, id, link_file, overrides or [], excuses or [], as_json=as_json)
     statuses = [law["status"] for law in table["laws"]]
     failed = statuses.count("failed")
     if as_json:
@@ -82,7 +81,7 @@ def check(
 def _check_link(
     link_file: str | None, overrides: Sequence[str], *, as_json: bool
 ) -> tuple[str, dict[str, Any]]:
-    """Hold all of a link against its laws, each shown as it is judged; its name, and what JSON says."""
+    """Check a link against its laws, and print each outcome at once; return its name and the JSON table."""
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.testing.suite import check_link
 
@@ -94,12 +93,12 @@ def _check_link(
         if not as_json:
             if not laws or laws[-1]["role"] != role:
                 console().print("the link" if id is None else f"{role} '{id}'", style="bold")
-            _show([outcome], _WIDTH)
-        laws.append({"role": role, "id": id, **_law(outcome)})
+            _print_outcomes([outcome], _WIDTH)
+        laws.append({"role": role, "id": id, **_describe_outcome(outcome)})
     return link_file or "the default link", {"link": link.digest, "laws": laws}
 
 
-def _check_one(
+def _check_algorithm(
     role: str,
     id: str,
     link_file: str | None,
@@ -108,7 +107,7 @@ def _check_one(
     *,
     as_json: bool,
 ) -> tuple[str, dict[str, Any]]:
-    """Hold an algorithm against the laws of its role; its name, and what JSON says."""
+    """Check an algorithm against the laws of its role; return its name and the JSON table."""
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.testing import check as hold, laws_of
@@ -122,10 +121,10 @@ def _check_one(
         if not equals:
             raise ConfigError(f"--excuse {text}: expected LAW=REASON")
         reasons[law.strip()] = reason.strip()
-    link = _link(role, id, link_file, overrides, registry)
+    link = _build_link(role, id, link_file, overrides, registry)
     outcomes = hold(role, link.algorithm(role), reasons, link)
     if not as_json:
-        _show(outcomes, max(len(o.law.name) for o in outcomes))
+        _print_outcomes(outcomes, max(len(o.law.name) for o in outcomes))
     table = {
         "role": role,
         "id": id,
@@ -133,17 +132,19 @@ def _check_one(
         "version": entry.version,
         "link": link.digest,
         "parameters": {k: v for k, v in link.table[role].items() if k != "id"},
-        "laws": [_law(outcome) for outcome in outcomes],
+        "laws": [_describe_outcome(outcome) for outcome in outcomes],
     }
     return f"{role} '{id}' of {entry.distribution} {entry.version}", table
 
 
-def _law(outcome: Verdict) -> dict[str, str]:
+def _describe_outcome(outcome: Verdict) -> dict[str, str]:
     law = outcome.law
     return {"law": law.name, "says": law.statement, "status": outcome.status, "detail": outcome.detail}
 
 
-def _link(role: str, id: str, link_file: str | None, overrides: Sequence[str], registry: Registry) -> Link:
+def _build_link(
+    role: str, id: str, link_file: str | None, overrides: Sequence[str], registry: Registry
+) -> Link:
     """The link with the algorithm in its role."""
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.link.resolve import load_link, resolve
@@ -163,23 +164,23 @@ def _link(role: str, id: str, link_file: str | None, overrides: Sequence[str], r
         else:
             rest.append(override)
     link = load_link(link_file, rest, registry)
-    # Parameters in the file are of the algorithm that the file selects.
+    # Parameters in the file belong to the algorithm that the file selects.
     keys = link.table.get(role, {"id": id})
     keys = keys if keys["id"] == id else {"id": id}
-    changed = {**link.table, role: {**keys, **own}}
+    tables = {**link.table, role: {**keys, **own}}
     overridden = frozenset((role, key) for key in own)
     if role == "framing" and link.table[role]["id"] != id:
-        # The steps of another framing are none of its own, and the default bar may be none for it.
-        changed = {name: values for name, values in changed.items() if name not in STEPS}
+        # Another framing's steps are not its own, and the default bar may not suit it.
+        tables = {name: values for name, values in tables.items() if name not in STEPS}
         if link_file is None and not any(name.startswith("bar.") for name in rest):
             try:
-                return resolve(changed, registry, overridden=overridden)
+                return resolve(tables, registry, overridden=overridden)
             except ConfigError:
-                changed["bar"] = dict(ONE_CLUSTER)
-    return resolve(changed, registry, source=link_file or "", overridden=overridden)
+                tables["bar"] = dict(ONE_CLUSTER)
+    return resolve(tables, registry, source=link_file or "", overridden=overridden)
 
 
-def _show(outcomes: Sequence[Verdict], width: int) -> None:
+def _print_outcomes(outcomes: Sequence[Verdict], width: int) -> None:
     from rich.text import Text
 
     out = console()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, echo, make_executor
-from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.errors import ConfigError, OutputError
 
@@ -64,20 +64,20 @@ def compare(
                 "results of a campaign stand alone: their variants are the campaign's links",
                 param_hint="REC...",
             )
-        code, comparison = 0, _of_results(Path(recordings[0]))
+        code, comparison = 0, _load_comparison(Path(recordings[0]))
     else:
-        code, comparison = _of_recordings(recordings, variants or [], link_files, overrides or [], jobs)
+        code, comparison = _compare_recordings(recordings, variants or [], link_files, overrides or [], jobs)
     if comparison.tables:
         _write(comparison, out or [])
         if as_json:
             echo(comparison.to_json(), nl=False)
         else:
-            _show(comparison, out or [])
+            _print_comparison(comparison, out or [])
     raise typer.Exit(code)
 
 
 def _check_outputs(out: Sequence[Path]) -> None:
-    """See that tables can be written here, before the work is done."""
+    """Check before the work that tables can be written here."""
     from evlcp_sdk.files import check_output
 
     for path in out:
@@ -106,7 +106,7 @@ def _is_campaign(url: str) -> bool:
         return False
 
 
-def _of_results(path: Path) -> Comparison:
+def _load_comparison(path: Path) -> Comparison:
     from evlcp_sdk.study.comparison import compare_links
     from evlcp_sdk.study.store import Store
     from evlcp_sdk.study.summary import summarize
@@ -115,7 +115,7 @@ def _of_results(path: Path) -> Comparison:
         return compare_links(summarize(store))
 
 
-def _of_recordings(
+def _compare_recordings(
     urls: Sequence[str],
     texts: Sequence[str],
     link_files: Sequence[str] | None,
@@ -127,25 +127,25 @@ def _of_recordings(
 
     if not texts:
         raise typer.BadParameter("name at least one, e.g. --variant paper:", param_hint="--variant")
-    if twice := {url for url in urls if urls.count(url) > 1}:
-        raise typer.BadParameter(f"{min(twice)} is named twice", param_hint="REC...")
+    if duplicates := {url for url in urls if urls.count(url) > 1}:
+        raise typer.BadParameter(f"{min(duplicates)} is named twice", param_hint="REC...")
     registry = Registry.load()
     variants = load_variants(texts, link_files, overrides, registry)
     here = not workers or len(urls) == 1
     executor = make_executor(0 if here else workers, None)
     tables: dict[str, Table] = {}
     code = 0
-    for outcome in executor.run(partial(_run, variants=variants, here=here), urls):
+    for outcome in executor.run(partial(_compare_recording, variants=variants, here=here), urls):
         if outcome.value is not None:
             tables[outcome.job] = outcome.value
         elif outcome.fault is not None:
-            complain(outcome.fault.message)
+            print_stderr(outcome.fault.message)
             code = max(code, outcome.fault.exit_code)
     ordered = [tables[url] for url in urls if url in tables]
     return code, comparison_of(ordered, variants, registry.versions())
 
 
-def _run(url: str, *, variants: tuple[Variant, ...], here: bool) -> Table:
+def _compare_recording(url: str, *, variants: tuple[Variant, ...], here: bool) -> Table:
     """Compare the variants on one recording, here or in a worker."""
     from evlcp_sdk.study.compare import compare_recording
 
@@ -163,14 +163,14 @@ def _write(comparison: Comparison, paths: Sequence[Path]) -> None:
         outputs.commit()
 
 
-def _show(comparison: Comparison, paths: Sequence[Path]) -> None:
+def _print_comparison(comparison: Comparison, paths: Sequence[Path]) -> None:
     from evlcp_sdk.study.comparison import MARK
 
     out = console()
     for one in comparison.tables:
         out.print(one.name, style="bold")
         head, lines = one.format_rows()
-        # The best have a mark behind them.
+        # The best end with a mark.
         print_table(out, head, [[t if best else f"{t} " for t, best in line] for line in lines], best=MARK)
         out.print()
     for note in comparison.notes:

@@ -37,7 +37,7 @@ def config(
     if codebook is not None:
         echo(link.codebook.to_json() if codebook == "json" else link.codebook.to_c())
         return
-    # A receiver compiles its algorithms: what they refuse is said here, not at the first recording.
+    # A receiver compiles its algorithms, so that what they refuse is reported here.
     Receiver(link)
     if digest:
         echo(link.digest)

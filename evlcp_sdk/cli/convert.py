@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, bytes_bar, echo, print_json
-from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.suggestions import format_count
 
 
@@ -42,21 +42,25 @@ def convert(
     from evlcp_sdk.run import convert as run_convert
     from evlcp_sdk.signals import stop_on_request
 
-    given = None
+    sensor_size = None
     if size is not None:
         try:
-            given = parse_size(size)
+            sensor_size = parse_size(size)
         except ValueError as fault:
             raise typer.BadParameter(f"{size!r}: expected {fault}", param_hint="--size") from fault
     with stop_on_request() as stopped, bytes_bar(Path(url).name) as advance:
-        told = run_convert(url, out, size=given, format=format, advance=advance, stopped=stopped)
+        result = run_convert(url, out, size=sensor_size, format=format, advance=advance, stopped=stopped)
     if as_json:
-        print_json({"out": str(out)} | told)
+        print_json({"out": str(out)} | result)
     else:
-        counts = told["counts"]
-        lost = [f"{one['count']} {one['meaning']}" for one in told["losses"].values()]
-        what = [format_count(counts["events"], "event"), format_count(counts["triggers"], "trigger"), *lost]
-        echo(f"{out}: {', '.join(what)}")
-    if told["error"] is not None:
-        complain(told["error"])
-        raise typer.Exit((UnpluggedError if told["unplugged"] else InputError).exit_code)
+        counts = result["counts"]
+        lost = [f"{one['count']} {one['meaning']}" for one in result["losses"].values()]
+        contents = [
+            format_count(counts["events"], "event"),
+            format_count(counts["triggers"], "trigger"),
+            *lost,
+        ]
+        echo(f"{out}: {', '.join(contents)}")
+    if result["error"] is not None:
+        print_stderr(result["error"])
+        raise typer.Exit((UnpluggedError if result["unplugged"] else InputError).exit_code)

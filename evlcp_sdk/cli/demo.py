@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 DEMO_NAME = "night-50m-30kmh-cut"
 CAMPAIGN_NAME = "demo"
 
-_FIRST_S = 0.06
-"""Of the first stretch, which is received before it counts: a packet at least."""
+_WARM_UP_S = 0.06
+"""Length of a first run that compiles the kernels: a packet at least."""
 
 
 def demo_files() -> tuple[Path, Path]:
@@ -56,13 +56,13 @@ def demo(
     if recording:
         _decode_recording(out, as_json)
     else:
-        _drive(out, workers, as_json)
+        _simulate_drive(out, workers, as_json)
 
 
-def _drive(out: Path, workers: int | None, as_json: bool) -> None:
+def _simulate_drive(out: Path, workers: int | None, as_json: bool) -> None:
     from dataclasses import replace
 
-    from evlcp_sdk.cli._campaign import campaign_bar, show_faults
+    from evlcp_sdk.cli._campaign import campaign_bar, print_faults
     from evlcp_sdk.cli._common import make_executor
     from evlcp_sdk.files import Outputs, writing
     from evlcp_sdk.report.drawing import save_plots
@@ -82,12 +82,12 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
         name.unlink(missing_ok=True)
     with Store(results, create=True) as store:
         with campaign_bar(plan.name) as show_progress:
-            # Here, where it shows and is done once: what each worker would compile by itself.
+            # Compile here, once and visibly, rather than in each worker.
             job = plan.jobs[0]
-            run_job(replace(job, scene=replace(job.scene, duration_s=_FIRST_S)))
+            run_job(replace(job, scene=replace(job.scene, duration_s=_WARM_UP_S)))
             progress = collect_results(plan, store, make_executor(workers, None), run_job, show_progress)
         summary = summarize(store)
-    show_faults(progress)
+    print_faults(progress)
     if progress.faults:
         raise typer.Exit(max(fault.exit_code for _, fault in progress.faults))
     with Outputs() as outputs:
@@ -97,14 +97,14 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     if as_json:
         print_json(summary.to_dict())
         return
-    show_drive(summary)
+    print_drive(summary)
     console().print(
         f"written: {results}, {out}/report.html for a browser, and a picture: {out}/rmse.png", style="dim"
     )
 
 
-def show_drive(summary: Summary) -> None:
-    """Print bits, BER with 95 % confidence and RMSE of each segment of distance beside the paper's."""
+def print_drive(summary: Summary) -> None:
+    """Print bits, BER with 95 % confidence and RMSE of each segment of distance, and the paper's."""
     from evlcp_sdk.study.intervals import measure_figure
     from evlcp_sdk.study.summary import compare_with_paper
     from evlcp_sdk.study.tally import SEGMENT_M, Tally
@@ -140,8 +140,7 @@ def show_drive(summary: Summary) -> None:
 
 
 def _decode_recording(out: Path, as_json: bool) -> None:
-
-    from evlcp_sdk.cli._summary import show
+    from evlcp_sdk.cli._summary import print_summary
     from evlcp_sdk.run import receive_to_folder
     from evlcp_sdk.sim.truth import read_truth
     from evlcp_sdk.study.frames import read_frames
@@ -151,31 +150,31 @@ def _decode_recording(out: Path, as_json: bool) -> None:
     if not as_json:
         console().print(f"decoding {recording.name} ...", style="dim")
     summary = receive_to_folder(recording, out, sinks=["figures"])
-    # The rows as they are written, which `evlcp score` reads, too.
-    found = score_frames(read_frames(out), read_truth(truth_file))
+    # The written rows, as `evlcp score` reads them.
+    score = score_frames(read_frames(out), read_truth(truth_file))
     if as_json:
-        print_json(summary | {"score": found})
+        print_json(summary | {"score": score})
         return
-    _show_frames(out / "frames.csv")
-    show(summary, out)
-    _show_score(found)
+    _print_frames(out / "frames.csv")
+    print_summary(summary, out)
+    _print_score(score)
 
 
-def _show_score(found: Mapping[str, Any]) -> None:
-    (bar,) = found["bars"]
+def _print_score(score: Mapping[str, Any]) -> None:
+    (bar,) = score["bars"]
     rmse = "-" if bar["rmse_m"] is None else f"{bar['rmse_m']:.3f} m"
     console().print(
         f"against the truth: {bar['frames_found']} of {bar['frames_sent']} frames found,"
-        f" {found['unmatched']} false, {bar['bit_errors']} of {bar['bits']} bits wrong, distance RMSE {rmse}"
+        f" {score['unmatched']} false, {bar['bit_errors']} of {bar['bits']} bits wrong, distance RMSE {rmse}"
     )
 
 
-def _show_frames(file: Path) -> None:
+def _print_frames(file: Path) -> None:
     import csv
 
     rows = []
-    with file.open(newline="") as opened:
-        for row in csv.DictReader(opened):
+    with file.open(newline="") as lines:
+        for row in csv.DictReader(lines):
             if row["echo_of"]:
                 continue
             distance_m, sigma_m = row["distance_m"], row["distance_sigma_m"]

@@ -41,17 +41,17 @@ def diagnose(
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)
     with bytes_bar(Path(recording).name) as advance:
-        found = run(recording, link, registry=registry, advance=advance)
+        diagnosis = run(recording, link, registry=registry, advance=advance)
     if out is not None:
         from evlcp_sdk.report.diagnosis_page import page
 
         with Outputs() as outputs:
-            outputs.write_text(page(found), out)
+            outputs.write_text(page(diagnosis), out)
             outputs.commit()
     if as_json:
-        print_json(found.to_dict())
+        print_json(diagnosis.to_dict())
         return
-    _show(found)
+    _print_diagnosis(diagnosis)
     if out is not None:
         console().print(f"written: {out}", style="dim")
 
@@ -65,22 +65,22 @@ _STYLES = {
 }
 
 
-def _show(found: Diagnosis) -> None:
+def _print_diagnosis(diagnosis: Diagnosis) -> None:
     from rich.table import Table
     from rich.text import Text
 
     out = console()
-    out.print(Text.assemble((Path(found.recording).name, "bold"), f": {found.headline}"))
+    out.print(Text.assemble((Path(diagnosis.recording).name, "bold"), f": {diagnosis.headline}"))
     stages = Table(box=None, pad_edge=False, show_header=False)
-    for one in found.checks:
+    for one in diagnosis.checks:
         word, style = _STYLES[one.verdict]
         stages.add_row(one.stage, Text(word, style), one.statement)
     out.print(stages)
-    if found.sources:
-        cells = [light.table_cells() for light in found.sources[:8]]
+    if diagnosis.sources:
+        cells = [light.table_cells() for light in diagnosis.sources[:8]]
         print_table(out, list(cells[0]), [list(one.values()) for one in cells], names=0)
-        if len(found.sources) > 8:
-            out.print(f"and {len(found.sources) - 8} more", style="dim")
-    for one in found.checks:
+        if len(diagnosis.sources) > 8:
+            out.print(f"and {len(diagnosis.sources) - 8} more", style="dim")
+    for one in diagnosis.checks:
         if one.next_step and one.verdict in ("doubt", "fail"):
             out.print(f"next: {one.next_step}", style="yellow")

@@ -25,10 +25,10 @@ def info(
     if as_json:
         print_json(table, 2)
     else:
-        echo(_text(table))
+        echo(_format_table(table))
 
 
-def _text(table: dict[str, Any]) -> str:
+def _format_table(table: dict[str, Any]) -> str:
     from evlcp_sdk.io.describe import RATE_WINDOW_US
 
     size = "" if table["bytes"] is None else f", {table['bytes']:,} bytes"

@@ -13,9 +13,9 @@ import typer
 
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import console
-from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.cli._receiving import CameraOptions, Cores, LinkOptions, PlaceOptions, ResultOptions
-from evlcp_sdk.cli._summary import delays_text, print_end
+from evlcp_sdk.cli._stderr import print_stderr
+from evlcp_sdk.cli._summary import format_delays, print_end
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -36,7 +36,7 @@ _SERVED = {"view": "look on", "nmea": "NMEA", "gpsd": "gpsd's JSON"}
 
 @dataclass(frozen=True)
 class ServingOptions:
-    """What is served beside the results."""
+    """Options of the services."""
 
     view: Annotated[bool, typer.Option("--view", help="Serve a page for browsers.")] = False
     view_host: Annotated[
@@ -70,19 +70,19 @@ class ServingOptions:
         typer.Option("--gpsd-port", min=0, max=65535, metavar="PORT", help="Serve positions as gpsd does."),
     ] = None
 
-    def chosen(self, out: Path | None, *, positions: bool) -> ServiceOptions:
-        """What to serve; recordings go into `out`, or this folder."""
+    def to_options(self, out: Path | None, *, positions: bool) -> ServiceOptions:
+        """The services; recordings go into `out`, or this folder."""
         from evlcp_sdk.live.services import ServiceOptions
 
         for name, port in (("--nmea-port", self.nmea_port), ("--gpsd-port", self.gpsd_port)):
             if port is not None and not positions:
                 raise typer.BadParameter("needs --sites", param_hint=name)
-        for name, changed in (
+        for name, is_given in (
             ("--view-host", self.view_host != _HERE),
             ("--view-port", self.view_port != 0),
             ("--view-record", self.view_record),
         ):
-            if changed and not self.view:
+            if is_given and not self.view:
                 raise typer.BadParameter("needs --view", param_hint=name)
         return ServiceOptions(
             self.view,
@@ -132,21 +132,21 @@ def live(
     from evlcp_sdk.run import live as run_live
     from evlcp_sdk.signals import stop_on_request
 
-    out, lines = result.out, result.lines([url])
+    out, lines = result.out, result.make_line_printer([url])
     registry = Registry.load()
     links = link.load(registry)
     plan = place.plan(links, mcap=result.mcap)
     clock = camera.clock(place)
-    chosen = serving.chosen(out, positions=plan is not None)
-    sinks = result.names(registry, positions=plan is not None)
+    services = serving.to_options(out, positions=plan is not None)
+    sinks = result.load_sink_names(registry, positions=plan is not None)
     attitude, publisher = camera.attitude(place), Publisher()
     with (
         stop_on_request() as stopped,
-        _served(chosen, publisher, links, url, plan, clock),
-        _going_on(publisher, silent=lines is not None),
+        _serve(services, publisher, links, url, plan, clock),
+        _show_status(publisher, silent=lines is not None),
     ):
         summary = run_live(
-            _reconnecting(url, registry, stopped) if reconnect else url,
+            _open_reconnecting(url, registry, stopped) if reconnect else url,
             out,
             links,
             registry=registry,
@@ -158,7 +158,7 @@ def live(
             lines=lines,
             publisher=publisher,
             budget=Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
-            stopped=stopped.or_when(lambda: out is None and lines is not None and lines.gone),
+            stopped=stopped.or_when(lambda: out is None and lines is not None and lines.closed),
         )
         print_end(summary, out, lines, as_json=result.as_json)
         code = _exit_code(summary, out if stopped() else None)
@@ -166,28 +166,28 @@ def live(
 
 
 @contextmanager
-def _served(
-    chosen: ServiceOptions,
+def _serve(
+    options: ServiceOptions,
     publisher: Publisher,
     links: Sequence[Link],
     url: str,
     plan: PositionPlan | None,
     clock: ClockZero,
 ) -> Iterator[None]:
-    """Serve what was chosen, and say where."""
+    """Serve, and print the addresses."""
     from evlcp_sdk.link.several import name_links
     from evlcp_sdk.live.services import serve
 
     sites = plan.sites if plan is not None else ()
     names = name_links(links)
-    with serve(chosen, publisher, names, name=Path(url).name, sites=sites, clock_zero=clock) as services:
+    with serve(options, publisher, names, name=Path(url).name, sites=sites, clock_zero=clock) as services:
         for name, server in services.items():
-            complain(f"{_SERVED[name]} at {server.url}")
+            print_stderr(f"{_SERVED[name]} at {server.url}")
         yield
 
 
-def _reconnecting(url: str, registry: Registry, stopped: Stopped) -> EventSource:
-    """A source that is opened again whenever it ends by a fault."""
+def _open_reconnecting(url: str, registry: Registry, stopped: Stopped) -> EventSource:
+    """Open a source that is opened again whenever it ends by a fault."""
     from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.reconnect import ReconnectingSource
 
@@ -195,7 +195,7 @@ def _reconnecting(url: str, registry: Registry, stopped: Stopped) -> EventSource
 
 
 def _exit_code(summary: dict[str, Any], interrupted: Path | None) -> int:
-    """The code of a run that failed; 0 of one that did not; raises for one that was interrupted."""
+    """The exit code of a run; raises where it was interrupted."""
     from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
 
     if interrupted is not None:
@@ -206,33 +206,33 @@ def _exit_code(summary: dict[str, Any], interrupted: Path | None) -> int:
 
 
 @contextmanager
-def _going_on(publisher: Publisher, *, silent: bool) -> Iterator[None]:
-    """A line on stderr that says how it goes, on a terminal only, and not between lines of JSON."""
+def _show_status(publisher: Publisher, *, silent: bool) -> Iterator[None]:
+    """Show the status in a line on stderr, on a terminal only, and not between lines of JSON."""
     from rich.live import Live
 
     err = console(stderr=True)
     if silent or not err.is_interactive:
         yield
         return
-    mine = publisher.subscribe({"status"}, most=1)
+    subscription = publisher.subscribe({"status"}, most=1)
 
     def draw() -> None:
         with Live(console=err, transient=True, auto_refresh=False) as shown:
-            while not mine.ended:
-                for news in mine.take(timeout_s=1.0):
-                    shown.update(going_text(news.value), refresh=True)
+            while not subscription.ended:
+                for news in subscription.take(timeout_s=1.0):
+                    shown.update(format_status(news.value), refresh=True)
 
     thread = threading.Thread(target=draw, name="evlcp-line", daemon=True)
     thread.start()
     try:
         yield
     finally:
-        publisher.unsubscribe(mine)
+        publisher.unsubscribe(subscription)
         thread.join()
 
 
-def going_text(status: LiveStatus) -> str:
-    """How a live run goes, in a line."""
+def format_status(status: LiveStatus) -> str:
+    """The status of a live run, in a line."""
     from evlcp_sdk.live.budget import LEVELS
 
     text = f"{status.elapsed_s:.0f} s, {status.events_per_s / 1e6:.1f} Mev/s"
@@ -241,9 +241,9 @@ def going_text(status: LiveStatus) -> str:
     if messages := status.counts.get("messages", 0):
         text += f", {messages} messages"
     if (recent := status.recent["total"])["count"]:
-        text += f", delay {delays_text(recent)}"
+        text += f", delay {format_delays(recent)}"
     if lost := sum(loss.count for loss in status.losses.values()):
         text += f", {lost} lost"
-    # Each level says what it adds to those before.
+    # The text of a level adds to those before.
     shed = ", ".join(LEVELS[1 : status.level + 1])
     return f"{text}; {shed}" if shed else text

@@ -1,6 +1,6 @@
-"""Entry point of the `evlcp` command line: whatever happens ends in lines on stderr and an exit code.
+"""Entry point of the `evlcp` command line: every fault ends in lines on stderr and an exit code.
 
-It imports nothing that takes time before it can be interrupted.
+It imports nothing slow before it can be interrupted.
 """
 
 from __future__ import annotations
@@ -9,32 +9,32 @@ import gc
 import os
 import sys
 
-from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.cli._stderr import print_stderr
 
 _FAILED = 1
 _INTERRUPTED = 130
 
-_GARBAGE = 250_000
-"""New objects before the collector of garbage looks for cycles: to load Numba makes 170 000, a run few."""
+_GARBAGE_THRESHOLD = 250_000
+"""New objects before the garbage collector looks for cycles: loading Numba makes 170 000, a run few."""
 
 
 def main() -> None:
-    """Run the command line; whatever goes wrong becomes one line per fault on stderr and its exit code."""
+    """Run the command line; every fault becomes a line on stderr and an exit code."""
     code: object = 0
-    # Our matrices are of a dozen rows: a thread a core only spins on them. NumPy reads it when it is loaded.
+    # Matrices have a dozen rows, too few for threads. NumPy reads it when it is loaded.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # To look for plugins of pydantic is to read what every package says of itself.
+    # The search for plugins of pydantic reads the metadata of every package.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    gc.set_threshold(_GARBAGE, *gc.get_threshold()[1:])
-    before = sys.unraisablehook
+    gc.set_threshold(_GARBAGE_THRESHOLD, *gc.get_threshold()[1:])
+    previous_hook = sys.unraisablehook
 
     def unraisable(fault: sys.UnraisableHookArgs) -> None:
-        # Ctrl-C that falls into a callback, such as those of imports, Python would only report, and go on. It
-        # comes again with the next call.
+        # Python only reports a Ctrl-C that falls into a callback, such as those of imports. It is raised
+        # again at the next call.
         if fault.exc_type is KeyboardInterrupt:
-            sys.setprofile(_interrupt)
+            sys.setprofile(_interrupt_next_call)
         else:
-            before(fault)
+            previous_hook(fault)
 
     sys.unraisablehook = unraisable
     try:
@@ -50,43 +50,43 @@ def main() -> None:
     except SystemExit as end:
         code = end.code
         if code == _INTERRUPTED:
-            complain("interrupted")
+            print_stderr("interrupted")
     except KeyboardInterrupt:
         code = _INTERRUPTED
-        complain("interrupted")
+        print_stderr("interrupted")
     except BaseException as fault:
         code = _report_fault(fault)
-    sys.unraisablehook = before
-    if not _stdout_took_all() and not code:
+    sys.unraisablehook = previous_hook
+    if not _flush_stdout() and not code:
         code = _FAILED
-    # Else the interpreter's end looks for cycles in all that was imported, a tenth of a second.
+    # Or else the interpreter looks for cycles in all imports at its end, a tenth of a second.
     gc.freeze()
     sys.exit(code)  # type: ignore[arg-type]
 
 
-def _interrupt(_frame: object, event: str, _of: object) -> None:
-    """Raise, as a profiler that is told of the next call."""
+def _interrupt_next_call(_frame: object, event: str, _of: object) -> None:
+    """Raise KeyboardInterrupt, as a profiler at the next call."""
     if event == "call":
         sys.setprofile(None)
         raise KeyboardInterrupt
 
 
 def _report_fault(fault: BaseException) -> int:
-    """Say what went wrong; the exit code."""
+    """Print what went wrong; return the exit code."""
     from evlcp_sdk.errors import explain_fault
 
-    # Our own files are written where their names are known, so what has none is stdout.
+    # Only stdout has no name here.
     if isinstance(fault, OSError) and fault.filename is None:
-        complain(f"standard output: {fault.strerror or fault}")
+        print_stderr(f"standard output: {fault.strerror or fault}")
         _drop_stdout()
         return _FAILED
     message, code = explain_fault(fault)
-    complain(message)
+    print_stderr(message)
     return code
 
 
-def _stdout_took_all() -> bool:
-    """Whether all that was printed has been written; says so if not, but for a reader who has left."""
+def _flush_stdout() -> bool:
+    """Write the rest of stdout; whether that worked. A fault is reported, unless the reader has left."""
     import errno
 
     try:
@@ -94,7 +94,7 @@ def _stdout_took_all() -> bool:
             sys.stdout.flush()
     except OSError as fault:
         if fault.errno != errno.EPIPE:
-            complain(f"standard output: {fault.strerror}")
+            print_stderr(f"standard output: {fault.strerror}")
         _drop_stdout()
         return False
     except ValueError:
@@ -104,7 +104,7 @@ def _stdout_took_all() -> bool:
 
 
 def _drop_stdout() -> None:
-    """Let what is not written yet go nowhere: or else it is tried again, and complained of twice."""
+    """Discard what is not written yet, or else it is tried again, and reported twice."""
     from contextlib import suppress
 
     with suppress(OSError, ValueError, AttributeError):

@@ -21,21 +21,21 @@ def plugins(as_json: Json = False) -> None:
     """
     from evlcp_sdk.plugin.registry import Registry
 
-    table = table_of(Registry.load())
+    table = tabulate_plugins(Registry.load())
     if as_json:
         print_json(table, 2)
     else:
-        echo(_text(table))
+        echo(_format_table(table))
 
 
-def table_of(registry: Registry) -> dict[str, list[dict[str, Any]]]:
-    """What is installed, as `--json` prints it: roles, algorithms, broken plugins."""
+def tabulate_plugins(registry: Registry) -> dict[str, list[dict[str, Any]]]:
+    """Roles, algorithms and broken plugins, as `--json` prints them."""
     from collections import Counter
 
     from evlcp_sdk.plugin.records import find_message_kinds, find_sinks
     from evlcp_sdk.plugin.roles import ROLES
 
-    # Asked for what else they bring, more of them may turn out to be broken.
+    # This may find more broken plugins.
     find_sinks(registry)
     find_message_kinds(registry)
     entries = registry.list_algorithms()
@@ -49,7 +49,7 @@ def table_of(registry: Registry) -> dict[str, list[dict[str, Any]]]:
                 "version": e.version,
                 "default": ROLES[e.algorithm.role].default == e.algorithm.id,
                 "conflict": count[e.algorithm.role, e.algorithm.id] > 1,
-                "fault": _fault(e),
+                "fault": _find_fault(e),
             }
             for e in entries
         ],
@@ -59,20 +59,20 @@ def table_of(registry: Registry) -> dict[str, list[dict[str, Any]]]:
     }
 
 
-def _fault(one: InstalledAlgorithm) -> str | None:
-    """Why an algorithm of somebody else's cannot be used; None for one that can."""
+def _find_fault(installed: InstalledAlgorithm) -> str | None:
+    """Why another package's algorithm cannot be used; None for one that can."""
     from evlcp_sdk.errors import PluginError
     from evlcp_sdk.plugin.registry import load_class
 
     try:
-        if one.distribution != "evlcp-sdk":
-            load_class(one)
+        if installed.distribution != "evlcp-sdk":
+            load_class(installed)
     except PluginError as fault:
         return str(fault)
     return None
 
 
-def _text(table: dict[str, list[dict[str, Any]]]) -> str:
+def _format_table(table: dict[str, list[dict[str, Any]]]) -> str:
     keys = ("id", "distribution", "version", "summary")
     widths = [max((len(str(a[k])) for a in table["algorithms"]), default=0) for k in keys]
     lines = []

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import Dask, bytes_bar, hush, make_executor, print_json, progress_bar
-from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.cli._common import Dask, bytes_bar, make_executor, print_json, progress_bar, silence_matplotlib
 from evlcp_sdk.cli._receiving import (
     CameraOptions,
     Cores,
@@ -22,6 +21,7 @@ from evlcp_sdk.cli._receiving import (
     PlaceOptions,
     ResultOptions,
 )
+from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.cli._summary import print_end
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReceiveJob:
-    """One recording, the folder that its result goes to, and its link if it is not the one of all."""
+    """One recording, the folder of its result, and its link if it has one of its own."""
 
     url: str
     folder: Path | None
@@ -85,19 +85,24 @@ def receive(
     """
     from evlcp_sdk.plugin.registry import Registry
 
-    lines = result.lines(recordings)
-    jobs = _jobs(recordings, result.out, lines)
+    lines = result.make_line_printer(recordings)
+    jobs = _make_jobs(recordings, result.out, lines)
     registry = Registry.load()
     links = link.load(registry)
     if link_mode == "auto":
         if len(links) > 1:
             raise typer.BadParameter("varies one link: give one -c, or none", param_hint="--link")
-        jobs = [_fitted(job, links[0], registry) for job in jobs]
+        jobs = [_infer_job_link(job, links[0], registry) for job in jobs]
     plan = place.plan(links, mcap=result.mcap)
-    sinks = result.names(registry, positions=plan is not None)
-    given: dict[str, Any] = {"links": links, "plan": plan, "attitude": camera.attitude(place), "sinks": sinks}
-    given["workers"] = cores
-    decode = partial(_decode, clock=partial(camera.clock, place), lines=lines, **given)
+    sinks = result.load_sink_names(registry, positions=plan is not None)
+    options: dict[str, Any] = {
+        "links": links,
+        "plan": plan,
+        "attitude": camera.attitude(place),
+        "sinks": sinks,
+    }
+    options["workers"] = cores
+    decode = partial(_decode, clock=partial(camera.clock, place), lines=lines, **options)
     here = dask is None and (not workers or len(jobs) == 1)
     if lines is not None and not here:
         raise typer.BadParameter("are given by this process only", param_hint="--json-lines")
@@ -117,7 +122,7 @@ def _run_jobs(
     """Decode all, here if a registry is given, else in workers; print how each ended.
 
     Raises:
-        InterruptedRunError: Whoever started it ended it.
+        InterruptedRunError: The user has ended it.
     """
     from evlcp_sdk.signals import stop_on_request
     from evlcp_sdk.study.jobs import stop_workers
@@ -129,7 +134,7 @@ def _run_jobs(
         ExitStack() as stack,
     ):
         run = partial(decode, here=None if registry is None else (registry, stopped))
-        for outcome in stack.enter_context(closing(executor.run(run, _until(stopped, jobs)))):
+        for outcome in stack.enter_context(closing(executor.run(run, _take_until_stopped(stopped, jobs)))):
             outcomes.append(outcome)
             if advance is not None:
                 advance(len(outcomes), len(jobs))
@@ -147,24 +152,24 @@ def _run_jobs(
 
 def _print_failure(outcome: Outcome[ReceiveJob, dict[str, Any]], *, as_json: bool) -> None:
     message = outcome.fault.message if outcome.fault else "no result"
-    complain(message)
+    print_stderr(message)
     if as_json:
         print_json({"status": "failed", "error": message, "recording": {"path": outcome.job.url}})
 
 
 def _exit_code(outcomes: Sequence[Outcome[ReceiveJob, dict[str, Any]]], *, strict: bool) -> int:
-    """That of the worst failure; else of a recording of which too much was dropped, or of a warning."""
+    """The code of the worst failure; else of a recording of which much was dropped, or of a warning."""
     failures = [one.fault.exit_code for one in outcomes if one.fault is not None]
     summaries = [one.value for one in outcomes if one.value is not None]
     statuses = [summary["status"] for summary in summaries]
     if "failed" in statuses:
         failures.append(InputError.exit_code)
-    warned = any(summary["warnings"] for summary in summaries)
-    return max(failures, default=0) or DEGRADED * ("degraded" in statuses) or int(strict and warned)
+    has_warnings = any(summary["warnings"] for summary in summaries)
+    return max(failures, default=0) or DEGRADED * ("degraded" in statuses) or int(strict and has_warnings)
 
 
-def _fitted(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:
-    """A job with the link that fits its recording best; says which."""
+def _infer_job_link(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:
+    """Give a job the link that fits its recording best, and print it."""
     from evlcp_sdk.diagnosis.diagnose import infer_link
     from evlcp_sdk.io.open import STDIN, open_source
 
@@ -175,14 +180,15 @@ def _fitted(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:
     with open_source(job.url, registry) as source:
         trials = infer_link(source, link, registry)
     best = trials[0]
-    for said in dict.fromkeys(one.explanation for one in trials if one.explanation):
-        complain(f"{Path(job.url).name}: {said}")
     name, due = Path(job.url).name, best.frames + best.rejected
+    for explanation in dict.fromkeys(one.explanation for one in trials if one.explanation):
+        print_stderr(f"{name}: {explanation}")
     if not best.fits:
-        complain(f"{name}: no link that was tried fits, so the one given is taken; see evlcp diagnose {name}")
+        print_stderr(
+            f"{name}: no link that was tried fits, so the one given is taken; see evlcp diagnose {name}"
+        )
         return job
-    chosen = best.options() or "as given"
-    complain(f"{name}: link {chosen}, {best.frames} of {due} frames accepted")
+    print_stderr(f"{name}: link {best.options() or 'as given'}, {best.frames} of {due} frames accepted")
     return replace(job, link=best.link)
 
 
@@ -193,38 +199,38 @@ def _decode(
     links: tuple[Link, ...],
     clock: Callable[[], datetime | PulseClock | None],
     lines: LinePrinter | None,
-    **given: Any,
+    **options: Any,
 ) -> dict[str, Any]:
-    """The summary of a recording, decoded here with a bar; or, without `here`, quietly in a worker."""
+    """Decode a recording here, with a bar, or quietly in a worker; return its summary."""
     from evlcp_sdk.run import receive_to_folder
     from evlcp_sdk.signals import stop_on_request
 
-    run = partial(receive_to_folder, job.url, job.folder, job.link or links, clock_zero=clock(), **given)
+    run = partial(receive_to_folder, job.url, job.folder, job.link or links, clock_zero=clock(), **options)
     if here is not None:
         registry, stopped = here
-        ended = stopped.or_when(lambda: job.folder is None and lines is not None and lines.gone)
-        with bytes_bar(_named(job.url)) as advance:
-            return run(registry=registry, lines=lines, advance=advance, stopped=ended)
-    hush()
+        stop = stopped.or_when(lambda: job.folder is None and lines is not None and lines.closed)
+        with bytes_bar(_source_name(job.url)) as advance:
+            return run(registry=registry, lines=lines, advance=advance, stopped=stop)
+    silence_matplotlib()
     # A terminal sends Ctrl-C to workers, too.
-    with stop_on_request() as asked:
-        return run(stopped=asked)
+    with stop_on_request() as stop:
+        return run(stopped=stop)
 
 
-def _until(stopped: Callable[[], bool], jobs: Sequence[ReceiveJob]) -> Iterator[ReceiveJob]:
+def _take_until_stopped(stopped: Callable[[], bool], jobs: Sequence[ReceiveJob]) -> Iterator[ReceiveJob]:
     for job in jobs:
         if stopped():
             return
         yield job
 
 
-def _named(url: str) -> str:
+def _source_name(url: str) -> str:
     from evlcp_sdk.io.open import STDIN
 
     return "standard input" if url == STDIN else Path(url).name
 
 
-def _jobs(recordings: Sequence[str], out: Path | None, lines: LinePrinter | None) -> list[ReceiveJob]:
+def _make_jobs(recordings: Sequence[str], out: Path | None, lines: LinePrinter | None) -> list[ReceiveJob]:
     from evlcp_sdk.io.open import STDIN
 
     if STDIN in recordings and len(recordings) > 1:
@@ -238,20 +244,20 @@ def _jobs(recordings: Sequence[str], out: Path | None, lines: LinePrinter | None
     jobs = [ReceiveJob(url, out / _stem(url)) for url in recordings]
     folders = [job.folder for job in jobs]
     for job in jobs:
-        wrong = ""
+        fault = ""
         if _stem(job.url) in ("", ".", ".."):
-            wrong = f"{job.url}: gives no name of a folder in {out}; receive it by itself"
+            fault = f"{job.url}: gives no name of a folder in {out}; receive it by itself"
         elif folders.count(job.folder) > 1:
-            wrong = f"two recordings would both be written to {job.folder}; receive them one by one"
-        if wrong:
-            raise typer.BadParameter(wrong, param_hint="REC...")
-        # The user named OUT, and nobody what is in it.
+            fault = f"two recordings would both be written to {job.folder}; receive them one by one"
+        if fault:
+            raise typer.BadParameter(fault, param_hint="REC...")
+        # The user has named OUT, but nothing in it.
         if job.folder is not None and job.folder.is_symlink():
             raise OutputError(f"{job.folder}: cannot be written: it is a link, which may lead out of {out}")
     return jobs
 
 
 def _stem(url: str) -> str:
-    """The recording's name without its kind: `night.csv.gz` gives `night`."""
+    """A recording's name without its suffixes: `night.csv.gz` gives `night`."""
     name = Path(url).name
     return name.removesuffix(".gz").rsplit(".", 1)[0] or name

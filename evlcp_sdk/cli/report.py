@@ -59,35 +59,35 @@ def report(
     if as_json:
         print_json(summary.to_dict(), 1)
     elif markdown:
-        echo(as_markdown(summary))
+        echo(to_markdown(summary))
     else:
         if summary.done < summary.tasks:
             console().print(f"{summary.done} of {summary.tasks} tasks are done", style="yellow")
-        show_tables(summary)
+        print_tables(summary)
         if out is not None:
             console().print(f"written: {out}, {folder}/*.png, *.svg", style="dim")
 
 
-def show_tables(summary: Summary) -> None:
-    """Print every figure, what became of positions, and the paper's figures beside those of the campaign."""
-    for number, (head, rows, names) in enumerate(_tables(summary)):
+def print_tables(summary: Summary) -> None:
+    """Print every figure, the positions, and the paper's figures beside those of the campaign."""
+    for number, (head, rows, names) in enumerate(_collect_tables(summary)):
         if number:
             console().print()
         print_table(console(), head, rows, names)
 
 
-def as_markdown(summary: Summary) -> str:
+def to_markdown(summary: Summary) -> str:
     """The same tables as Markdown, the paper's first."""
     parts = []
-    for head, rows, _ in reversed(_tables(summary)):
+    for head, rows, _ in reversed(_collect_tables(summary)):
         cells = [[cell.replace("\\", "\\\\").replace("|", "\\|") for cell in row] for row in rows]
         lines = [head, ["---"] * len(head), *cells]
         parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
     return "\n\n".join(parts)
 
 
-def _tables(summary: Summary) -> list[tuple[Sequence[str], Sequence[Sequence[str]], int]]:
-    """Head and rows of each table that has rows, and how many of its columns say what a row is."""
+def _collect_tables(summary: Summary) -> list[tuple[Sequence[str], Sequence[Sequence[str]], int]]:
+    """Head and rows of each table that has rows, and the number of columns that name a row."""
     from evlcp_sdk.study import report
     from evlcp_sdk.study.summary import compare_with_paper
 

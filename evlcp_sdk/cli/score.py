@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, console, print_json
-from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.cli._stderr import print_stderr
 
 
 def score(
@@ -37,19 +37,21 @@ def score(
     frames = read_frames(folder)
     truth = read_truth(truth_file, registry)
     if not links:
-        complain(f"{folder}/summary.json: not there, so nothing says with which link it was received")
+        print_stderr(f"{folder}/summary.json: not there, so nothing says with which link it was received")
     else:
         check_link(truth, links, str(folder))
     for warning in truth.warnings:
-        complain(warning)
-    found = score_frames(frames, truth, links if len(links) > 1 else None)
-    if frames and not any(bar["frames_found"] for bar in found["bars"]):
-        complain(f"warning: no row of {folder} matches {truth_file}: another recording's, by times or places")
+        print_stderr(warning)
+    table = score_frames(frames, truth, links if len(links) > 1 else None)
+    if frames and not any(bar["frames_found"] for bar in table["bars"]):
+        print_stderr(
+            f"warning: no row of {folder} matches {truth_file}: another recording's, by times or places"
+        )
     if as_json:
-        print_json(found)
+        print_json(table)
         return
     screen = console()
-    for kind, part in (("", found), ("road: ", found["road"])):
+    for kind, part in (("", table), ("road: ", table["road"])):
         echoes = f", said to be reflections {part['echoes']}" if "echoes" in part else ""
         screen.print(f"{kind}rows {part['rows']}, matching no true frame {part['unmatched']}{echoes}")
         for i, bar in enumerate(part["bars"]):
@@ -72,4 +74,4 @@ _FIGURES = {
     "nees": "NEES {nees}",
     "over_half_metre": ">=0.5 m: {over_half_metre}",
 }
-"""How figures of a bar are shown, as far as a score has them."""
+"""Formats of the figures of a bar, as far as a score has them."""

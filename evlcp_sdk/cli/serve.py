@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.cli._stderr import print_stderr
 
 
 def serve(
@@ -37,7 +37,7 @@ def serve(
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.signals import stop_on_request
 
-    address = None if tcp is None else _address(tcp)
+    address = None if tcp is None else _parse_address(tcp)
     if address is None and unix is None:
         raise typer.BadParameter("give --tcp PORT, or --unix PATH", param_hint="--tcp")
     with stop_on_request() as stopped, open_until_stopped(url, Registry.load(), stopped) as opened:
@@ -45,19 +45,19 @@ def serve(
         source = opened if opened.live else ReplaySource(opened)
         with Sender(source, address, unix) as sender:
             if address is not None:
-                complain(f"sending {url} to whoever connects to tcp://{address[0]}:{sender.port}")
+                print_stderr(f"sending {url} to whoever connects to tcp://{address[0]}:{sender.port}")
             if unix is not None:
-                complain(f"sending {url} to whoever connects to unix:{unix}")
+                print_stderr(f"sending {url} to whoever connects to unix:{unix}")
             if recorded and not sender.wait(stopped):
                 return
             try:
                 sender.run(stopped)
             finally:
                 if dropped := sender.counts["pieces_dropped"]:
-                    complain(f"{dropped} pieces dropped: who received them was too slow")
+                    print_stderr(f"{dropped} pieces dropped: who received them was too slow")
 
 
-def _address(text: str) -> tuple[str, int]:
+def _parse_address(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not (port.isascii() and port.isdigit() and int(port) < 65536):
         raise typer.BadParameter(f"{text!r}: expected PORT or HOST:PORT", param_hint="--tcp")

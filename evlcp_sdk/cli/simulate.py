@@ -62,14 +62,13 @@ def simulate(
             )
         echo(preset_text(preset), nl=False)
         return
-    source = _source_of(scene_file, preset)
+    source = _choose_source(scene_file, preset)
     if out is None:
         raise typer.BadParameter("where should the recording go?", param_hint="-o REC.raw")
     _render(source, out, seed, link, overrides or [], threads, as_json=as_json)
 
 
 def _list_presets(*, as_json: bool) -> None:
-
     from evlcp_sdk.sim import preset_names, preset_text
 
     if as_json:
@@ -80,15 +79,15 @@ def _list_presets(*, as_json: bool) -> None:
         console().print(f"{name:14} {next(comments, '')}")
 
 
-def _source_of(scene_file: str | None, preset: str | None) -> Path | str:
-    """The scene that is meant: a file's path, or a preset's name."""
+def _choose_source(scene_file: str | None, preset: str | None) -> Path | str:
+    """The path of a scene's file, or the name of a preset."""
     from evlcp_sdk.files import path_exists
     from evlcp_sdk.sim import preset_names, preset_text
 
     if (scene_file is None) == (preset is None):
         raise typer.BadParameter("name either a scene.toml or a --preset", param_hint="scene.toml")
     if preset is not None:
-        preset_text(preset)  # a file of that name is not meant
+        preset_text(preset)  # raises if there is none
         return preset
     assert scene_file is not None
     if scene_file in preset_names() and not path_exists(scene_file):
@@ -108,7 +107,7 @@ def _render(
     *,
     as_json: bool,
 ) -> None:
-    """Render a scene into files, and say how that went."""
+    """Render a scene into files, and print a summary."""
     import time
 
     from evlcp_sdk.errors import ConfigError
@@ -118,10 +117,10 @@ def _render(
         raise ConfigError(f"{out}: a recording is written as NAME.raw")
     simulated = render(source, seed, link=link, overrides=overrides, threads=threads)
     scene = simulated.scene
-    began = time.perf_counter()
+    start_s = time.perf_counter()
     with progress_bar(out.name) as advance:
         written = simulated.save(out, lambda done_s: advance(done_s, scene.duration_s))
-    elapsed_s = time.perf_counter() - began
+    elapsed_s = time.perf_counter() - start_s
     counts = simulated.simulation.counts
     size = out.stat().st_size
     summary: dict[str, Any] = {

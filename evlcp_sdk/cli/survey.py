@@ -56,12 +56,12 @@ def survey(
     registry = Registry.load()
     links = load_links(link_files, overrides or [], registry)
     if poses is not None:
-        for name, given in (
+        for name, value in (
             ("--attitude", place.attitude_file),
             ("--gnss", place.gnss),
             ("--clock-zero", place.clock_zero),
         ):
-            if given is not None:
+            if value is not None:
                 raise typer.BadParameter("needs --sites", param_hint=name)
         found = run.survey(recordings, read_poses(poses), links, registry=registry, name=str(poses))
     else:
@@ -73,7 +73,7 @@ def survey(
 
 
 def _write(found: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None:
-    """Write the sites, and say which they are."""
+    """Write the sites, and print them."""
     from dataclasses import asdict
 
     from evlcp_sdk.files import Outputs
@@ -92,10 +92,10 @@ def _write(found: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None:
         print_json({"bars": bars})
     else:
         for bar in found:
-            console().print(_line(bar))
+            console().print(_format_bar(bar))
 
 
-def _line(bar: SurveyedBar) -> str:
+def _format_bar(bar: SurveyedBar) -> str:
     site = bar.site
     kind = f" ({site.link})" if site.link else ""
     return (

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._campaign import campaign_bar, show_faults
+from evlcp_sdk.cli._campaign import campaign_bar, print_faults
 from evlcp_sdk.cli._common import Dask, Json, Workers, console, make_executor, print_json
 
 if TYPE_CHECKING:
@@ -69,20 +69,20 @@ def sweep(
                 with campaign_bar(plan.name) as show:
                     progress = collect_results(plan, store, executor, run_job, show)
             except KeyboardInterrupt:
-                so_far = progress_of(plan, store.read_results())
-                done = f"{so_far.done} of {so_far.tasks} tasks are in {path}"
+                progress = progress_of(plan, store.read_results())
+                done = f"{progress.done} of {progress.tasks} tasks are in {path}"
                 raise InterruptedRunError(f"interrupted; {done}; the same command goes on") from None
-    show_faults(progress)
+    print_faults(progress)
     if as_json:
         numbers = {k: v for k, v in asdict(progress).items() if k != "faults"}
         print_json({"results": str(path), **numbers, "failed": len(progress.faults)})
     else:
-        _show(plan.name, progress, None if dry_run else path)
+        _print_progress(plan.name, progress, None if dry_run else path)
     raise typer.Exit(max((fault.exit_code for _, fault in progress.faults), default=0))
 
 
-def _show(name: str, progress: Progress, written: Path | None) -> None:
-    """Say how far a campaign is, and where its results are."""
+def _print_progress(name: str, progress: Progress, written: Path | None) -> None:
+    """Print the progress of a campaign, and the place of its results."""
     screen = console()
     screen.print(
         f"{name}: {progress.done} of {progress.tasks} tasks,"

@@ -60,7 +60,7 @@ def video(
     registry = Registry.load()
     links = load_links(link_files, overrides or [], registry)
     with bytes_bar(Path(recording).name) as advance:
-        told = film(
+        summary = film(
             recording,
             out,
             links,
@@ -73,24 +73,23 @@ def video(
             advance=advance,
         )
     if as_json:
-        print_json(told)
+        print_json(summary)
     else:
-        _show(told, Path(recording).name)
+        _print_film(summary, Path(recording).name)
 
 
-def _show(told: dict[str, Any], name: str) -> None:
-    """Say what was filmed."""
+def _print_film(film: dict[str, Any], name: str) -> None:
     screen = console()
-    if told["frames"]:
-        transmitters = format_count(len(told["transmitters"]), "transmitter")
-        found = f"{transmitters}, {format_count(told['frames'], 'frame')}"
+    if film["frames"]:
+        transmitters = format_count(len(film["transmitters"]), "transmitter")
+        found = f"{transmitters}, {format_count(film['frames'], 'frame')}"
     else:
         found = "no frame is decoded there"
     screen.print(
-        f"{name}: {told['for_ms']:g} ms from {told['from_ms']:.1f} ms on, at 1/{told['slow']:g}; {found}"
+        f"{name}: {film['for_ms']:g} ms from {film['from_ms']:.1f} ms on, at 1/{film['slow']:g}; {found}"
     )
     screen.print(
-        f"written: {told['film']}, {told['pictures']} pictures of {told['width']} x {told['height']} px,"
-        f" {told['bytes'] / 1e6:.1f} MB",
+        f"written: {film['film']}, {film['pictures']} pictures of {film['width']} x {film['height']} px,"
+        f" {film['bytes'] / 1e6:.1f} MB",
         style="dim",
     )

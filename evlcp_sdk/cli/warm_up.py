@@ -19,15 +19,15 @@ def warm_up(as_json: Json = False) -> None:
     from evlcp_sdk.warming import STEPS, warm_up as warm
 
     with progress_bar("compiling") as advance:
-        warmth = warm(lambda step: advance(STEPS.index(step), len(STEPS)))
+        result = warm(lambda step: advance(STEPS.index(step), len(STEPS)))
     if as_json:
-        print_json(asdict(warmth) | {"kept_in": warmth.kept_in and str(warmth.kept_in)})
+        print_json(asdict(result) | {"kept_in": result.kept_in and str(result.kept_in)})
         return
-    if not warmth.compiled:
-        console().print(f"nothing to compile; tried in {warmth.elapsed_s:.1f} s")
+    if not result.compiled:
+        console().print(f"nothing to compile; tried in {result.elapsed_s:.1f} s")
         return
-    console().print(f"{format_count(warmth.compiled, 'kernel')} compiled in {warmth.elapsed_s:.0f} s")
-    if warmth.kept_in is None:
+    console().print(f"{format_count(result.compiled, 'kernel')} compiled in {result.elapsed_s:.0f} s")
+    if result.kept_in is None:
         console().print(
             "they cannot be kept, so each process compiles them again: give it a home, or a folder by"
             " NUMBA_CACHE_DIR",

@@ -149,7 +149,7 @@ KeepAlive = Annotated[
 
 def keep_alive(board: "Board") -> None:
     """Keep a board's watchdog from acting until Ctrl-C; print changes of state and faults on stderr."""
-    from evlcp_sdk.cli._complain import complain
+    from evlcp_sdk.cli._stderr import print_stderr
     from firmware_host.board.tables import enum_name, flag_names
     from firmware_host.protocol.generated.requests import BoardFault, State
 
@@ -161,7 +161,7 @@ def keep_alive(board: "Board") -> None:
             status = board.status()
             if (status.state, status.faults) != before:
                 faults = ", ".join(flag_names(BoardFault, status.faults)) or "none"
-                complain(f"{board.session.name}: state {enum_name(State, status.state)}, faults {faults}")
+                print_stderr(f"{board.session.name}: state {enum_name(State, status.state)}, faults {faults}")
 
 
 def print_program_result(done: Any, as_json: bool) -> None:

@@ -498,7 +498,7 @@ def _print_event(
     event: StatusReply | BoardGone | BoardReturned | KeyMissing, which: dict[str, Any], as_json: bool
 ) -> None:
     """Print a line of `monitor`: a status on stdout, other events on stderr."""
-    from evlcp_sdk.cli._complain import complain
+    from evlcp_sdk.cli._stderr import print_stderr
     from firmware_host.board.monitor import BoardGone, BoardReturned, KeyMissing
     from firmware_host.board.tables import enum_name, status_table
     from firmware_host.protocol.generated.requests import State
@@ -507,13 +507,15 @@ def _print_event(
     if isinstance(event, BoardGone):
         if as_json:
             print_json(which | fault_table(event.fault))
-        complain(f"{event.fault}; it is looked for, end with Ctrl-C")
+        print_stderr(f"{event.fault}; it is looked for, end with Ctrl-C")
     elif isinstance(event, BoardReturned):
         if as_json:
             print_json(which | {"back_after_s": round(event.after_s, 3)})
-        complain(f"{name}: answers again after {event.after_s:.1f} s")
+        print_stderr(f"{name}: answers again after {event.after_s:.1f} s")
     elif isinstance(event, KeyMissing):
-        complain(f"{name}: has a key: without it (--key) this host does not keep its watchdog from acting")
+        print_stderr(
+            f"{name}: has a key: without it (--key) this host does not keep its watchdog from acting"
+        )
     elif as_json:
         print_json(which | status_table(event))
     else:

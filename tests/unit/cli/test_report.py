@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from evlcp_sdk.cli.report import as_markdown
+from evlcp_sdk.cli.report import to_markdown
 from evlcp_sdk.study.collect import collect_results
 from evlcp_sdk.study.comparison import compare_links
 from evlcp_sdk.study.jobs import Inline
@@ -190,4 +190,4 @@ def test_what_became_of_positions_is_a_table_of_its_own(summary: Summary, tmp_pa
     assert right[8:] == ("1", "1", "0", "0.200", "3", "0.100", "6")
     assert off[1:5] == ("0 of 3", "2", "0.0%", "0")
     assert "<h2>Positions</h2>" in render_campaign(found)
-    assert "| right | 2 of 2 | 0 | 100.0% |" in as_markdown(found)
+    assert "| right | 2 of 2 | 0 | 100.0% |" in to_markdown(found)

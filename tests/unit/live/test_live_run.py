@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.cli._summary import show
-from evlcp_sdk.cli.live import going_text
+from evlcp_sdk.cli._summary import print_summary
+from evlcp_sdk.cli.live import format_status
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import RawSource, ReplaySource, open_source, write_events
 from evlcp_sdk.link.compose import compose
@@ -61,12 +61,12 @@ def test_a_replay_gives_what_the_file_gives(demo_raw, tmp_path, capsys) -> None:
     assert summary["live"]["delays"]["total"]["count"] > 0
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["live"] == summary["live"]
     assert publisher.pictures.newest is not None
-    text = going_text(last)
+    text = format_status(last)
     assert text.startswith(f"{last.elapsed_s:.0f} s, ")
     assert f", {last.counts['frames']} frames" in text
-    shed = going_text(dataclasses.replace(last, level=2))
+    shed = format_status(dataclasses.replace(last, level=2))
     assert shed == f"{text}; rows outside of regions are shed, and distances of most frames"
-    show(summary, None)
+    print_summary(summary, None)
     total = summary["live"]["delays"]["total"]
     message = f"delay of {total['count']} frames, from the last chip: p50 {total['p50_ms']:.1f}, p99"
     assert message in capsys.readouterr().out

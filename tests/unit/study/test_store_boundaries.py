@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from evlcp_sdk.cli.report import as_markdown, show_tables
+from evlcp_sdk.cli.report import print_tables, to_markdown
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.study.collect import collect_results
 from evlcp_sdk.study.comparison import compare_links
@@ -107,8 +107,8 @@ def test_what_still_runs_is_read_from_its_log(results: Path) -> None:
 def draw_page(summary: Summary) -> Elements:
     """Everything that is told of a summary; its page."""
     json.dumps(summary.to_dict(), allow_nan=False)
-    show_tables(summary)
-    as_markdown(summary)
+    print_tables(summary)
+    to_markdown(summary)
     draw_charts(summary)
     compared = compare_links(summary)
     compared.to_json()
