@@ -923,14 +923,7 @@ def count_answers_between(
 
 @njit
 def count_answers_across(
-    sums: Array,
-    codes: Array,
-    every: int,
-    places: Array,
-    seen: Array,
-    way: complex,
-    along: float,
-    out: Array,
+    sums: Array, codes: Array, every: int, places: Array, seen: Array, way: complex, along: float, out: Array
 ) -> None:
     """Count how pixels beside the middle of clusters answer the edges that tell clusters apart.
 
@@ -1693,13 +1686,7 @@ def farthest_offset_px(selected: Array, grid: int, on: complex, turn: complex) -
 
 @njit
 def assign_cells(
-    at: Array,
-    cluster: Array,
-    cells: Array,
-    places: Array,
-    reach: float,
-    half: float,
-    seen: Array,
+    at: Array, cluster: Array, cells: Array, places: Array, reach: float, half: float, seen: Array
 ) -> tuple[int, int, float, int]:
     """Find which clusters are `seen` in their place (K,): by more cells than others have there.
 

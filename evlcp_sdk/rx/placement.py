@@ -200,11 +200,7 @@ def mask_presence(presence: PresenceMap, layout: Layout, placement: Placement) -
 
 
 def drop_hidden_clusters(
-    sums: NDArray[np.int16],
-    edges: NDArray[np.int64],
-    every: int,
-    presence: PresenceMap,
-    placement: Placement,
+    sums: NDArray[np.int16], edges: NDArray[np.int64], every: int, presence: PresenceMap, placement: Placement
 ) -> tuple[PresenceMap, Placement]:
     """Drop the clusters whose light is not in their place: behind a cover, or out of the image.
 
@@ -243,7 +239,7 @@ def orient_centres(layout: Layout, mirrored: bool) -> NDArray[np.complex128]:
 def _find_best(
     blobs: _Blobs, layout: Layout, slack_px: float, before: Placement | None
 ) -> tuple[Placement | None, int]:
-    """The placement with most cells, None without blobs that could propose one; and the cells in no place."""
+    """The placement with most cells, and the cells in no place; None without blobs that could propose one."""
     best_score, best = 0.0, None
     orientations = (False,) if layout.is_line else (False, True)
     for mirrored in orientations if before is None or layout.is_line else (before.mirrored,):
@@ -257,30 +253,17 @@ def _find_best(
             best_score, best = score, (s, shift, mirrored)
     if best is None:
         return None, 0
-    s, shift, mirrored = best
-    return _assess_similarity(blobs, layout, slack_px, s, shift, mirrored, 1 if before is not None else 2)
-
-
-def _assess_similarity(
-    blobs: _Blobs,
-    layout: Layout,
-    slack_px: float,
-    scale: complex,
-    shift: complex,
-    mirrored: bool,
-    proposed: int,
-) -> tuple[Placement, int]:
-    """The placement by a similarity, with the probability of chance; and the cells in no place."""
-    clusters = len(layout.centres_m)
+    scale, shift, mirrored = best
     places = scale * orient_centres(layout, mirrored) + shift
-    spacing_px, reach = abs(scale) * layout.spacing_m, _cell_reach_px(scale, layout, slack_px)
-    seen = np.empty(clusters, np.bool_)
-    shown, hits, cells, left = _kernels.assign_cells(*blobs, places, reach, spacing_px / 2, seen)
+    spacing_px, reach_px = abs(scale) * layout.spacing_m, _cell_reach_px(scale, layout, slack_px)
+    seen = np.empty(len(places), np.bool_)
+    shown, hits, cells, left = _kernels.assign_cells(*blobs, places, reach_px, spacing_px / 2, seen)
     # Where clusters are small, a cell stands in the place of two.
-    probability = min(1.0, (2 * reach / spacing_px) ** (1 if layout.is_line else 2) / clusters)
+    p_hit = min(1.0, (2 * reach_px / spacing_px) ** (1 if layout.is_line else 2) / len(places))
     # As many similarities could have been proposed as there are choices of the clusters that fix one.
+    proposed = 1 if before is not None else 2
     tries = math.comb(max(shown, proposed), proposed)
-    chance = min(1.0, tries * _binomial_tail(hits - proposed, shown - proposed, probability))
+    chance = min(1.0, tries * _binomial_tail(hits - proposed, shown - proposed, p_hit))
     if layout.is_line:
         direction = scale * layout.direction
         mirrored = direction.real + direction.imag < 0

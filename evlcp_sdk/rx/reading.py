@@ -280,16 +280,8 @@ class FrameReader:
             calibrated = calibrate_llr(soft, np.zeros_like(lit))
         if not due.has_pilot:
             # Another distance or other points by the same pilot would be nothing new.
-            return FrameReading(
-                soft.symbols,
-                calibrated,
-                _NO_RANGE,
-                *_NO_POINTS,
-                aligned.centre_px,
-                _NO_LINE_OF_SIGHT,
-                spread=None,
-                flooded=flooded,
-            )
+            unseen = *_NO_POINTS, aligned.centre_px, _NO_LINE_OF_SIGHT, None
+            return FrameReading(soft.symbols, calibrated, _NO_RANGE, *unseen, flooded)
         distance = _NO_RANGE
         if ranged:
             whole = self._aligner.drop_cut_clusters(aligned)

@@ -276,12 +276,7 @@ class Transmitters:
     """The regions with what is known of them; those in sight are `alive`, by the number of their region."""
 
     def __init__(
-        self,
-        packet: PacketFormat,
-        step_us: int,
-        limits: Limits,
-        numbers: Iterator[int],
-        trailing_chips: int,
+        self, packet: PacketFormat, step_us: int, limits: Limits, numbers: Iterator[int], trailing_chips: int
     ) -> None:
         self._packet = packet
         self._lookback_us = LOOKBACK_PACKETS * packet.packet_chips * packet.chip_us

@@ -9,4 +9,4 @@ from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 def evlcp_algorithms() -> Iterator[Algorithm]:
     """The algorithms of this package."""
     yield Algorithm("ranging", "centroid", "evlcp_centroid.ranging:CentroidRanging", 2, "centres of gravity")
-    yield Algorithm("ranging", "none", "evlcp_centroid.none:NoRanging", 1, "no distance, of any layout")
+    yield Algorithm("ranging", "none", "evlcp_centroid.ranging:NoRanging", 1, "no distance, of any layout")

@@ -1,7 +1,7 @@
-"""Distance from the clusters' centres of gravity."""
+"""Distance from the clusters' centres of gravity, and none: for one cluster, or where bearings are enough."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -101,3 +101,14 @@ class CentroidRanging(Ranging):
             return Range(distance, distance * float(np.sqrt(variance / power)) / size, kept)
 
         return measure
+
+
+@dataclass(frozen=True)
+class NoRanging(Ranging):
+    """Gives no distance; takes every layout."""
+
+    measures: ClassVar[bool] = False
+
+    def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
+        """Nothing to precompute."""
+        return lambda _: _NO_RANGE

@@ -9,9 +9,5 @@ from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 def evlcp_algorithms() -> Iterator[Algorithm]:
     """The algorithms of this package."""
     yield Algorithm(
-        "ranging",
-        "joint-scale",
-        "evlcp_joint.ranging:JointScaleRanging",
-        2,
-        "one fit over all boundaries",
+        "ranging", "joint-scale", "evlcp_joint.ranging:JointScaleRanging", 2, "one fit over all boundaries"
     )

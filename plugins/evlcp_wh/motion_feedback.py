@@ -75,10 +75,7 @@ class MotionFeedback(Decoding):
             return refined
 
         def refine(
-            presence: PresenceMap,
-            sums: NDArray[np.int16],
-            soft: SoftSymbols,
-            matches: NDArray[np.float32],
+            presence: PresenceMap, sums: NDArray[np.int16], soft: SoftSymbols, matches: NDArray[np.float32]
         ) -> tuple[SoftSymbols, bool]:
             """Decode with the motion removed; return whether the motion may be beyond the shifts searched.
 
