@@ -455,7 +455,7 @@ def add_polarities(
             late = t[i] - origin - row_us * line[i] - apart * sign[i]
             chip = np.int32(min(late * rate, 1e9))
             which[i] = np.int32(-1) if late < 0 else chip
-        # The first and the last chip of those that there are.
+        # The first and the last chip of these events.
         low, high = _NOWHERE, np.uint32(0)
         for i in range(n):
             c = np.uint32(which[i])
@@ -471,7 +471,7 @@ def add_polarities(
                 c = np.uint32(which[i])
                 u, v = np.uint32(np.int32(column[i]) - left), np.uint32(np.int32(line[i]) - top)
                 inside = (c < many) & (u < columns) & (v < rows)
-                # Products have 64 bits, of which half as many are calculated at a time.
+                # Products of 64 bits would be computed half as many at a time.
                 line_at = np.uint32(np.uint32(c * rows) + v)
                 where[i] = np.uint32(np.uint32(line_at * columns) + u) if inside else _NOWHERE
             for i in range(n):
@@ -592,7 +592,7 @@ def find_blobs(selected: Array, grid: int) -> tuple[Array, Array, Array]:
                 of[0, n], of[1, n] = k, count
                 most = max(most, count)
                 n += 1
-    # Where those of a number of cells begin, behind those with more.
+    # Where blobs of each size begin, behind larger ones.
     begin = np.zeros(most + 2, np.int64)
     for i in range(n):
         begin[most - of[1, i] + 1] += 1
@@ -889,7 +889,7 @@ def count_answers_between(
     half, first, last = zones
     chips = codes.shape[1]
     _, height, width = sums.shape
-    # Chips behind the neighbour's edges, those first in which the cluster stays on, and which way they go.
+    # Chips behind the neighbour's edges, first those in which the cluster stays on, and the edges' signs.
     behind, edge = np.empty(chips, np.int64), np.empty(chips, np.int64)
     for pair in range(len(pairs)):
         a, b = pairs[pair]
@@ -982,7 +982,7 @@ def mask_presence(
         wide = measure_core_profile(likely, seen, places, unit, spacing, grid, edge, profile)
         across = float(wide)
         if wide == 0:
-            # A line that shows nowhere is still none of a panel, which is what no profile says.
+            # A width of 0 would mean a panel; the line shows nowhere.
             wide, profile[0] = 1, 0.0
     (clusters, rows, columns), (_, height, width) = prior.shape, pixels.shape
     half = spacing / 2 + grid
@@ -1056,7 +1056,7 @@ def measure_light(
     out[:] = 0
     inner, many = 0.0, 0
     first, last = max(int(np.ceil(place - far)), 0), min(int(place + far), lines - 1)
-    # Whole rows of pixels, side by side, are summed in less time than what is asked of them.
+    # Whole rows of pixels are summed faster than single ones.
     top, bottom = first, last
     if not rows:
         margin = abs(slope) * far + reach + 0.5
@@ -1093,7 +1093,7 @@ def find_boundary(mine: Array, its: Array, start: float, end: float) -> float:
 
     In each line from `start` to `end`, the light of both (`measure_light`) gives the first's share.
     """
-    # Centres within a pixel have no way between them that its lines could share out.
+    # Centres within a pixel have no lines between them.
     if abs(end - start) < 1.0:
         return np.nan
     sign = 1 if end > start else -1
@@ -1159,7 +1159,7 @@ def find_offset_across(
                 into, line = light[v - top], image[v, left:]
                 for u in range(wide):
                     into[u] += weight * line[u]
-    # What lies within `along`, how far beside, and where in the profile: the same in each round.
+    # Pixels within `along`: light, distance to the side, and place in the profile, for all rounds.
     lit, aside, at = np.empty(light.size), np.empty(light.size), np.empty(light.size, np.int64)
     upright, many = abs(unit.imag) >= abs(unit.real), 0
     for v in range(top, bottom + 1):
@@ -1463,7 +1463,7 @@ def calibrate_llr(
             for b in range(bits):
                 off += (abs(np.float64(llr[k, b])) - own) ** 2
             off += frame_worth * squares / n + expected_worth * (spread * own) ** 2
-            # One of the bits goes into the mean.
+            # The mean takes one degree of freedom.
             scale = 2 * own * (bits - 1 + frame_worth + expected_worth) / off if own > 0 else 0.0
             for b in range(bits):
                 scaled[k, b] = llr[k, b] * scale
@@ -1491,7 +1491,7 @@ def fit_newest(
     likely, inverse, path = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     left = np.empty(n)
     scale = 1.0
-    # The scale says how much the likely counts against the values, and hardly changes after the first.
+    # The scale weighs the priors against the values, and hardly changes after the first round.
     for _ in range(2):
         normal[:] = 0.0
         right[:] = 0.0
@@ -1599,7 +1599,7 @@ def add_phase_bias(
     """
     right, inverse = np.empty((2, 3)), np.empty((3, 3))
     weight, moved = sums[0], np.empty(place.size)
-    # A literal 0 would make a median of its own.
+    # A literal 0 would compile another median.
     many: Any = np.int64(0)
     n, lightest = _solve_parabola(place, weight, sums[1:], least, right, inverse)
     squares, mean_squares, pattern_squares, light, all_light = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -1656,7 +1656,7 @@ def estimate_foreshortening(
             off = (sine[i] - seen) / sigma
             chance[i] = likely[i] * exp(-0.5 * min(off * off, 1400.0))
         if not chance.sum() > 0:
-            # A curvature that no tilt makes says nothing of one.
+            # A curvature that no tilt makes is no evidence of one.
             chance = likely
     total, mean, square = 0.0, 0.0, 0.0
     for i in range(sine.size):
@@ -1788,7 +1788,7 @@ def fit_row_slope(
             top[b] = max(top[b], fit[b, lag])
     middle = median(top.copy(), blocks) if blocks else 0.0
     at, place = np.empty(blocks), np.empty(blocks)
-    # A literal 0 would make a median of its own.
+    # A literal 0 would compile another median.
     n: Any = np.int64(0)
     for b in range(blocks):
         if top[b] > max(middle / 4, chance * np.sqrt(seen[b])):

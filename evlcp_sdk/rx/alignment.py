@@ -288,7 +288,7 @@ class FrameAligner:
             along_px = across_px = abs(own.scale) * layout.spacing_m / 2
             direction = placement.scale / abs(placement.scale)
             if layout.is_line:
-                # A line's width is that of its cells, as the layout does not have it.
+                # The layout has no width of a line: that of its cells counts.
                 turn = own.scale / abs(own.scale) * layout.direction
                 across_px = _kernels.farthest_offset_px(selected, grid, own.shift, turn) + grid / 2
                 direction *= layout.direction

@@ -221,7 +221,7 @@ class PacketFraming(Framer):
             self._transmitters.drop_old_events(transmitter, due, step.end_us)
             if region.released:
                 self._end_transmitter(transmitter, step.end_us)
-                # Its last frames may have shown that it is a part of another.
+                # Its last frames may have shown it to be a part of another.
                 if region.id not in self._dropped:
                     self.counts["regions_released"] += 1
                     self._transmitters.release(transmitter)
@@ -428,7 +428,7 @@ class PacketFraming(Framer):
         if aligned is None:
             return Skipped.DARK if _is_dark(transmitter, due, self._packet) else Skipped.REJECTED
         if transmitter.number is None and self._reflections.has_frame_at(due.start_us, aligned.centre_px):
-            # The same bar once more: where the first region was then is not known as well as what it showed.
+            # The same bar once more: frames show its place at that time better than its region does.
             self._regions.drop(transmitter.region)
             self.forget_region(transmitter.region)
             return Skipped.REJECTED

@@ -61,7 +61,7 @@ class Guard:
 
     def __init__(self, link: Link, role: str, *, may_refuse: bool = False) -> None:
         id = link.table[role]["id"]
-        # To exit is not an algorithm's to decide; to interrupt is the user's.
+        # An algorithm may not exit; a user may interrupt.
         allowed: list[type[BaseException]] = [PluginError, KeyboardInterrupt]
         self._allowed = (*allowed, ConfigError) if may_refuse else tuple(allowed)
         self._role, self._id = role, id

@@ -83,7 +83,7 @@ class Placement:
 
     def centres_px(self, layout: Layout) -> NDArray[np.complex128]:
         """Cluster centres in the image, px, complex128 (K,); not to be changed."""
-        # They are needed again and again in a frame.
+        # Kept, as a frame needs them several times.
         known: tuple[Layout, NDArray[np.complex128]] | None = vars(self).get("_centres_px")
         if known is None or known[0] is not layout:
             known = layout, self.scale * orient_centres(layout, self.mirrored) + self.shift
@@ -162,7 +162,7 @@ def find_placements(
         # Most images show one bar; the rest of them needs no vote.
         if cells < _OTHER_SHARE * found[0].cells:
             break
-        # What is neither in the placement's clusters' places nor elsewhere in the bar.
+        # Blobs outside of the placement: neither in a cluster's place nor elsewhere in the bar.
         at, cluster, many = blobs
         reach_px = _cell_reach_px(best.scale, layout, slack_px)
         off = np.abs(at[:, None] - best.centres_px(layout)).min(1) > reach_px
@@ -189,7 +189,7 @@ def mask_presence(presence: PresenceMap, layout: Layout, placement: Placement) -
     spacing_px = abs(placement.scale) * layout.spacing_m
     places = placement.centres_px(layout)
     given = presence.probability, presence.selected, presence.pixels
-    # Most of them stays 0, and is not written, as `zeros_like` does.
+    # Most stays 0, and `zeros`, unlike `zeros_like`, does not write it.
     cells, dtype = given[0].shape, given[0].dtype
     prior, probability, selected = np.zeros(cells, dtype), np.zeros(cells, dtype), np.zeros(cells, np.bool_)
     pixels = np.zeros(given[2].shape, given[2].dtype)

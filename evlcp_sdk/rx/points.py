@@ -66,7 +66,7 @@ def compile_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> Find
         pilot_sums: NDArray[np.int16],
         corner_px: tuple[float, float],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[float, float]]:
-        # One cluster alone has no direction.
+        # A single cluster has no direction.
         unit = placement.scale / (abs(placement.scale) or 1.0)
         reach_px, places = abs(placement.scale) * spacing_m, placement.centres_px(layout)
         at_m = orient_centres(layout, placement.mirrored)

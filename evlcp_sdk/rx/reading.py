@@ -217,7 +217,7 @@ class FrameResult(NamedTuple):
 
 
 class FrameJob(NamedTuple):
-    """A frame to decode, with what its bar's earlier frames do not tell.
+    """A frame to decode, with what is not in its bar's state.
 
     Attributes:
         region: Where the bar is, with the events of the frame.
@@ -346,7 +346,7 @@ class FrameDecoder:
         if aligned is None:
             return None
         shown = self.locate_bar(aligned) if due.has_pilot else None
-        # Within half of the seam, all events are there.
+        # Within half of the seam no events are missing.
         if shown is not None and region.deviation_px(shown) > MARGIN_PX / 2:
             return None
         found, state = self.read(aligned, due, state, job.attitude, ranged=job.ranged)

@@ -81,7 +81,7 @@ _REMEMBER_US = 1e6
 
 
 class FrameDetection(NamedTuple):
-    """A decoded frame, with what tells a bar from its reflection.
+    """A decoded frame, with what distinguishes a bar from its reflection.
 
     Attributes:
         frame: The frame.

@@ -372,7 +372,7 @@ class Transmitters:
             region.first_us = max(region.first_us, int(keep_us))
         else:
             # A later lock may move the next frame's start by a chip; the preamble before a packet's first
-            # frame has yet to say how late the rows are.
+            # frame has yet to show the delay of the rows.
             keep_us = due.start_us - due.lock.chip_us
             if due.index == 0:
                 keep_us -= self._packet.preamble_chips * due.lock.chip_us

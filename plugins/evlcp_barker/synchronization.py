@@ -107,7 +107,7 @@ class _WanderingLevel:
     def update(self, value: float, drift_variance: float, noise_variance: float) -> "_WanderingLevel":
         """Update by a measurement (Kalman), by the variances of the change since the last, and of it."""
         change, spread = value - self.value, self.variance + drift_variance + noise_variance
-        # What is too far to have wandered has jumped: that much, then, was the way.
+        # A change too large for a drift is a jump, whose variance is its square.
         spread = max(spread, change**2) if change**2 > _JUMP_SIGMAS**2 * spread else spread
         gain = 1 - noise_variance / spread
         return _WanderingLevel(self.value + gain * change, gain * noise_variance)
@@ -203,12 +203,12 @@ class BarkerSynchronizer:
         if before_bin is None:
             # A preamble starts with a dark chip: the first event may already be the edge at its end.
             before_bin = next_bin = (int(t_us[0] // self._bin_us) if t_us.size else until_bin) - guard
-        # What no peak can be near to any more is left out.
+        # Bins that no later peak can be near are dropped.
         first_bin = max(next_bin - guard, before_bin)
         lo, bins = next_bin - first_bin, max(until_bin, before_bin + before.shape[1] - 1) - first_bin
         lags = bins - span + 1
         if not t_us.size and lags - guard > lo and not before[:, first_bin - before_bin :].any():
-            # Silence correlates with nothing, and most regions that are no bar are silent.
+            # Silence has no correlation, and most regions that are no bar are silent.
             first = max(first_bin + lags - 2 * guard, first_bin)
             counts = np.zeros((2, first_bin + bins + 1 - first))
             return state._replace(first_bin=first, counts=counts, next_bin=first_bin + lags - guard), []
@@ -312,7 +312,7 @@ class BarkerSynchronizer:
             preambles=1,
             on_us=found.on_us,
             rate_us=0.0,
-            # The bound is two sigmas of what clocks have.
+            # The bound is two sigmas.
             variances=(noise, 0.0, (self._max_drift_us() / 2) ** 2),
             off_delay=_WanderingLevel(0.0, self._packet.chip_us**2)
             if math.isnan(off_delay_us)

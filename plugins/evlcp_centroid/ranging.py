@@ -64,7 +64,7 @@ class CentroidRanging(Ranging):
         def measure(view: FrameView) -> Range:
             maps = view.presence.pixels.astype(np.float64)
             weight = maps.sum((1, 2))
-            # The outermost of what is seen may be cut off by what hides the others.
+            # The outermost that are seen may be partly hidden.
             seen = np.flatnonzero((weight > 0) & same)
             seen = seen[skip : len(seen) - skip]
             if len(seen) < least:
@@ -72,7 +72,7 @@ class CentroidRanging(Ranging):
             down = maps.sum(2)[seen] @ np.arange(maps.shape[1]) / weight[seen]
             right = maps.sum(1)[seen] @ np.arange(maps.shape[2]) / weight[seen]
             image, place = right + 1j * down, layout[seen]
-            # The start is robust: medians of pairs half of what is seen layout_steps, and of what they leave.
+            # The start is robust: medians of distant pairs, and of the residuals.
             at = np.full(bar.clusters, np.nan, np.complex128)
             at[seen] = image
             step = np.full(len(layout_steps), np.nan, np.complex128)

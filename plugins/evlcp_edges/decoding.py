@@ -77,7 +77,7 @@ class EdgeDecoding(Decoding):
             )
             unknown = np.full(len(seen), -1, np.int8)
             chips_before, chips_after = (unknown if sent is None else sent for sent in (before, after))
-            # Of each cluster's codewords, (K, symbols, info chips that there are).
+            # Of each cluster's codewords, (K, symbols, info chips).
             kinds = words[chips_before + 1, chips_after + 1, :, : seen.shape[1]]
             taught_counts = _sum_by_kind(pilots, shown[:, :pilot_chips])
             fit = self._log_likelihoods(seen, kinds, taught_counts.sum(0, keepdims=True))
@@ -86,7 +86,7 @@ class EdgeDecoding(Decoding):
                 decided = np.take_along_axis(kinds, fit.argmax(1)[:, None, None], 1)[:, 0]
                 decided[first - second < _SURE_ODDS] = 0
                 own_counts = _sum_by_kind(decided, shown[:, pilot_chips:])
-                # None is taught_counts by itself: what it was taken for would seem likelier.
+                # No cluster is taught by itself, which would confirm its codeword.
                 fit = self._log_likelihoods(seen, kinds, (taught_counts + own_counts).sum(0) - own_counts)
             symbols = fit.argmax(1)
             llr = np.empty((len(fit), bits.shape[1]), np.float32)
@@ -123,7 +123,7 @@ class EdgeDecoding(Decoding):
         of_pair = _to_shares(pairs, of_all)[:, None]
         of_triple = _to_shares(triples + self.pair_count * of_pair, of_pair)
         shares = np.concatenate([of_pair[:, 0], of_triple.reshape(len(counts), 8, -1)], 1)
-        # What comes with all of_all is worth the same: each histogram's prior is as large as it is itself.
+        # The prior grows with the histogram, so that equal rates have equal likelihoods.
         prior = self.prior_count * 9 / np.maximum(pairs.sum((1, 2)), 1e-9)[:, None, None]
         logs = np.log((shares + prior) / (1 + shares.shape[-1] * prior))
         return np.concatenate([np.zeros_like(logs[:, :1]), logs], 1)

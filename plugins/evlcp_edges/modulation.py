@@ -15,7 +15,7 @@ from evlcp_sdk.plugin.roles import Modulation
 
 @dataclass(frozen=True)
 class Ppm(Modulation):
-    """Pulse position modulation: in each pulse's time one chip is lit, which one is what it says.
+    """Pulse position modulation: in each pulse's time one chip is lit, by the data.
 
     `positions` chips a pulse; of `positions ** pulses` symbols, the first power of two carry bits.
 

@@ -65,7 +65,7 @@ class EdgeSeparation(Separation):
             flat = answers.reshape(n, -1).astype(np.float64)
             fits = apart * (edges @ flat) + half * (np.abs(edges) @ np.abs(flat))
             odds = np.exp(fits)
-            # To none, signs are a toss of coins; its prior is that of all clusters together.
+            # Without a cluster signs are random; its prior is that of all clusters together.
             probability = odds / (len(chips) + odds.sum(0))
             probability = probability.reshape(len(chips), rows, columns).astype(np.float32)
             probability[:, seen < self.min_answers] = 0

@@ -39,7 +39,7 @@ PRIOR = (
 """Weights of width and shifts being 0, relative to those of a row's values."""
 
 HUBER_LIMIT = 0.5
-"""Residual, in full values, beyond which a row weighs less: a cluster decoded wrong does not bend the fit."""
+"""Residual, in full values, beyond which a row weighs less: so that wrong symbols do not distort the fit."""
 
 PROFILE_REACH = 12.0
 """Widths of a boundary's core up to which it has an effect: 6 of 100000 of tails are beyond."""
@@ -118,7 +118,7 @@ def fit_line(middles: Array, line: Array) -> bool:
     """
     clusters = len(middles)
     points, values = np.empty((3, clusters)), np.empty(max(clusters * (clusters - 1) // 2, clusters))
-    # A literal 0 would make a median of its own.
+    # A literal 0 would compile another median.
     n: Any = np.int64(0)
     for k in range(clusters):
         if middles[k, 0] == middles[k, 0]:
@@ -151,8 +151,8 @@ def find_line(selected: Array, grid: int, middles: Array, line: Array, seen: Arr
     if not fit_line(middles, line):
         return False
     clusters, rows, columns = selected.shape
-    # A cluster is as long as the spacing; half of it and a cell of blur. Cells as wide as the bar is long are
-    # looked at first: it is narrower.
+    # A cluster is as long as the spacing; half of it and a cell of blur. At first, cells count
+    # as wide as the bar is long: it is narrower.
     reach, half, wide = abs(line[1]) / 2 + 1, int(abs(line[1]) * clusters / 2) + 1, 0.0
     for refined in range(2):
         counts = np.zeros(2 * half + 1, np.int64)
@@ -187,7 +187,7 @@ def find_line(selected: Array, grid: int, middles: Array, line: Array, seen: Arr
             half = int(wide + 1)
     if not fit_line(middles, line):
         return False
-    # In pixels; in whole cells, as wide as the core is.
+    # In pixels; the width is that of the core, in whole cells.
     middle = (grid - 1) / 2
     line[0], line[1] = line[0] * grid + middle, line[1] * grid
     line[2], line[4] = line[2] * grid + middle - line[3] * middle, (wide + 0.5) * grid
@@ -293,7 +293,7 @@ def list_steps(codes: Array, known: Array, motion: Array, reach: float, fit: Arr
     `fit` is (spacing, centre, drift, gain, width, by sign, by repeat): boundary b between clusters b - 1 and
     b of K is at spacing * (b - K / 2) from a centre that is centre + drift * time + offset from the middle
     row in a value, by `motion` (offset and time, values). Its rows are those within `reach` px, and nearest
-    to it; there are none where `known` (K + 1, values) says that one of the two codes is not known.
+    to it; there are none where `known` (K + 1, values) has one of the two codes as unknown.
 
     Sums of positive and of negative events are not alike, so a step up looks shifted to one side and a step
     down to the other. A cluster that repeats a value had another edge a chip before, whose late events, and

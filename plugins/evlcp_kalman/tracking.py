@@ -123,7 +123,7 @@ class _ConstantVelocity(Filter):
             mean, covariance = self._predict_state(state, t_us)
             missed = state.missed + 1
             if missed > self.pooled // 2:
-                # So many in a row are not outliers: what is tracked has changed.
+                # So many in a row are no outliers: the target has changed.
                 return self.step(None, t_us, value, sigma)
         else:
             gain = covariance[:, 0] / spread

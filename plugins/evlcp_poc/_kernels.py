@@ -31,7 +31,7 @@ def find_middles(maps: Array, apart_m: Array, min_pixels: int, out: Array) -> tu
             some = False
             for u in range(width):
                 some |= maps[k, v, u] > 0
-            # Most rows are dark, and that is seen of many pixels at a time.
+            # Most rows are dark, which is tested many pixels at a time.
             for u in range(width if some else 0):
                 w = maps[k, v, u]
                 if w > 0:
@@ -136,7 +136,7 @@ def fit_peaks(
     v0, u0, many, seen = rows // 2, columns // 2, 2 * samples + 1, np.empty(2 * samples + 1)
     peaks = np.empty((pairs, 2), np.int64)
     for q in range(pairs):
-        # Where nothing is seen, all are alike, and there is no shift.
+        # Without light all are equal, and there is no shift.
         peaks[q, 0], peaks[q, 1] = v0, u0
         for v in range(samples, rows - samples):
             for u in range(samples, columns - samples):

@@ -97,7 +97,7 @@ class PocRanging(Ranging):
         """
         selected = self._select_clusters(bar.clusters)
         if not self.clusters:
-            # Which are outermost follows from what is seen.
+            # The outermost are those of the clusters that are seen.
             selected = np.arange(bar.clusters)
         all_count = bool(self.clusters) or self.skip_outer == 0
         skip = self._skipped_at_ends(bar.clusters) if bar.is_even_line and not all_count else 0

@@ -252,7 +252,7 @@ class _PolarCode:
             raise ConfigError(f"LLRs of shape {llr.shape}: expected ({self.coded_bits},)")
         values = llr.astype(np.float64)
         if not np.isfinite(values).all():
-            # Surer than the others, but not so much that nothing is left of them in single precision.
+            # Surer than the others, but not so much that these vanish in single precision.
             sure = 2 * np.abs(values[np.isfinite(values)]).max(initial=1.0)
             values = np.nan_to_num(values, nan=0.0, posinf=sure, neginf=-sure)
         words = values[: self.words * self.length].reshape(self.words, -1)
@@ -289,7 +289,7 @@ class _PolarCode:
                         return codewords[path], inputs, True
                 if metric[path] < least:
                     guess, least = codewords[path], metric[path]
-            # Whatever a longer list found would most likely be as far off as all that this one has found.
+            # A longer list would most likely find nothing nearer.
             if limit < 0 or found == 0:
                 break
         return guess, transform(guess)[self.information], False

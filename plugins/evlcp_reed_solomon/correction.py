@@ -80,7 +80,7 @@ class _ReedSolomonCode:
         if llr.shape != (self.coded_bits,):
             raise ConfigError(f"LLRs of shape {llr.shape}: expected ({self.coded_bits},)")
         size = self.data + self.words * self.parity
-        # What is not a number says nothing.
+        # NaN is an erasure.
         llr = np.where(np.isnan(llr), np.float32(0), llr)
         signs = llr[: 8 * size] < 0
         received = np.packbits(signs)

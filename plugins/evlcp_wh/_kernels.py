@@ -78,7 +78,7 @@ def estimate_presence(
                 j = r * columns + c
                 values[i, j] = by_pixel[(r * width + c) * grid]
                 seen[j] = np.int16(seen[j] + abs(values[i, j]))
-    # The cells in which enough is seen, side by side.
+    # The cells with enough values, side by side.
     which, m = np.empty(n + 1, np.int64), 0
     for j in range(n):
         which[m] = j
@@ -87,7 +87,7 @@ def estimate_presence(
     for i in range(length):
         for j in range(m):
             some[i, j] = values[i, which[j]]
-    # A literal 0 would compile the fit once more.
+    # A literal 0 would compile the correlation once more.
     best, begin = np.empty(m, np.int16), n - n
     for j in range(m):
         best[j] = -length
@@ -212,7 +212,7 @@ def match_words(
         symbols[k], best[k] = top, fit[top]
         half = 1 << llr.shape[1]
         for b in range(llr.shape[1]):
-            # A bit that is done leaves the better of the two codewords that it tells apart.
+            # A finished bit leaves the better of its two codewords.
             half //= 2
             zero, one = -np.inf, -np.inf
             for s in range(half):

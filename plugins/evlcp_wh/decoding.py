@@ -106,7 +106,7 @@ class MlDecoder:
     """`MlSoft` for the pilots and codewords of a codebook of pair codes."""
 
     def __init__(self, codebook: Codebook) -> None:
-        # As large as LLRs are by what matches them.
+        # Scaled as LLRs are by the matching.
         words = np.ascontiguousarray(codebook.codeword_edges.T, np.float64)
         self._by_value = words * (INDEPENDENT_PIXELS / 2)
         # Unsigned, as indices below 0 would count from the end.
