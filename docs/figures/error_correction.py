@@ -26,7 +26,7 @@ from scipy import stats
 from scipy.special import ndtri
 
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS
-from evlcp_sdk.report.drawing import plain, titled
+from evlcp_sdk.report.drawing import set_heading, style_axes
 
 AIR_S = 346 * 100e-6
 """A packet of the default profile on air."""
@@ -256,8 +256,8 @@ def draw(found: dict[tuple[int, bool], list[tuple[float, int, int]]], path: Path
             style = {"ms": 5, "lw": 1.2, "capsize": 2, "color": colour, "label": f"n = {n}"}
             ax.errorbar(x, y, np.abs(bars - y), fmt=f"{marker}-", **style)
         ax.set(yscale="log", xlabel="bit error rate of hard decisions")
-        titled(ax, title)
-        plain(ax)
+        set_heading(ax, title)
+        style_axes(ax)
     axes[0].set_ylabel("frame error rate, with 95 % interval")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", frameon=False, fontsize=9, ncols=3)

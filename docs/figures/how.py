@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.codebook import edges_of_chips
 from evlcp_sdk.report.colours import cluster_colours
-from evlcp_sdk.report.drawing import plain, titled
+from evlcp_sdk.report.drawing import set_heading, style_axes
 from evlcp_sdk.study.bound import frame_bound
 
 ROOT = Path(__file__).parents[2]
@@ -76,7 +76,7 @@ def pixel(r: Recording) -> Figure:
     figure, (top, bottom) = plt.subplots(2, 1, figsize=(8, 3.6), height_ratios=(1, 2), sharex=True)
     top.stairs(sent, np.arange(33) * chip / 1e3, fill=True, color="#f0b429")
     top.set(ylim=(-0.1, 1.2), yticks=(0, 1), yticklabels=("dark", "lit"))
-    titled(top, f"What cluster {cluster} sent in a frame, and what four of its pixels saw")
+    set_heading(top, f"What cluster {cluster} sent in a frame, and what four of its pixels saw")
     for row in range(4):
         mine = e[(e.x == x) & (e.y == y - 2 + row)]
         for value, colour in ((1, ON), (0, OFF)):
@@ -88,7 +88,7 @@ def pixel(r: Recording) -> Figure:
     bottom.set(yticks=range(4), yticklabels=[f"row {y - 2 + row}" for row in range(4)], xlabel="ms")
     bottom.set(xlim=(0, 32 * chip / 1e3))
     for axis in (top, bottom):
-        plain(axis)
+        style_axes(axis)
     bottom.plot([], [], color=ON, label="brighter (ON)")
     bottom.plot([], [], color=OFF, label="darker (OFF)")
     bottom.legend(loc="upper center", bbox_to_anchor=(0.5, -0.3), ncols=2, frameon=False)
@@ -101,18 +101,18 @@ def codes(r: Recording) -> Figure:
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(9, 3))
     left.imshow(book.pilots, cmap=mpl.colors.ListedColormap(["#3a3a3a", "#f0b429"]), aspect="auto")
     left.set(xlabel="chip", ylabel="cluster")
-    titled(left, "Pilots, lit or dark")
+    set_heading(left, "Pilots, lit or dark")
     values = book.pilot_edges.astype(float)
     shown = middle.imshow(values @ values.T / values.shape[1], cmap="RdBu_r", vmin=-1, vmax=1)
     figure.colorbar(shown, ax=middle, shrink=0.8)
     middle.set(xlabel="cluster", ylabel="cluster")
-    titled(middle, "Correlation of pilots")
+    set_heading(middle, "Correlation of pilots")
     barker = edges_of_chips(book.preamble)[::2].astype(float)
     against = np.correlate(barker, barker, "full")
     right.stem(np.arange(len(against)) - len(barker) + 1, against, basefmt=" ")
     right.set(xlabel="shift, values", ylabel="correlation")
-    titled(right, "Preamble against itself")
-    plain(right)
+    set_heading(right, "Preamble against itself")
+    style_axes(right)
     return figure
 
 
@@ -130,7 +130,7 @@ def regions(r: Recording) -> Figure:
         )
     )
     left.set(xlim=(0, 1280), ylim=(720, 0), aspect="equal", xlabel="column, px", ylabel="row, px")
-    titled(left, "Events of 4 ms, and the region found")
+    set_heading(left, "Events of 4 ms, and the region found")
     inside = r.near_the_bar()
     for chosen, name, colour in ((inside, "where the bar is", "#c0272d"), (~inside, "elsewhere", "#888888")):
         apart = rises_apart(e[chosen]) / r.chip_us
@@ -138,8 +138,8 @@ def regions(r: Recording) -> Figure:
         right.stairs(count, edges, color=colour, label=f"{name}: {len(apart)} pairs")
     right.set(xlabel="from one rise of a pixel to the next, chips", ylabel="pairs of rises")
     right.legend(frameon=False)
-    titled(right, "The rhythm of the rises")
-    plain(right)
+    set_heading(right, "The rhythm of the rises")
+    style_axes(right)
     return figure
 
 
@@ -172,12 +172,12 @@ def timing(r: Recording) -> Figure:
     for lock in r.found["synchronization"]:
         left.axvline(lock.packet_t_us / 1e3, color="#c0272d", lw=1, ls=":")
     left.set(xlabel="camera time, ms", ylabel="correlation")
-    titled(left, "Correlation with the preamble; dotted: packets that the receiver found")
+    set_heading(left, "Correlation with the preamble; dotted: packets that the receiver found")
     right.plot((at - r.lock.packet_t_us) / chip, score, ".-", color=INK, lw=0.8, ms=3)
     right.set(xlim=(-4, 4), xlabel="chips from the packet's start")
-    titled(right, "The first peak")
+    set_heading(right, "The first peak")
     for axis in (left, right):
-        plain(axis)
+        style_axes(axis)
     return figure
 
 
@@ -188,12 +188,12 @@ def clusters(r: Recording) -> Figure:
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(9, 4.2), width_ratios=(1, 1, 3))
     total = np.abs(r.view.sums).sum(0)
     left.imshow(total, cmap="gray", aspect="equal")
-    titled(left, "Events")
+    set_heading(left, "Events")
     picture = np.ones((*shown.selected.shape[1:], 3))
     for k, chosen in enumerate(shown.selected):
         picture[chosen] = colours[k][:3]
     middle.imshow(picture, aspect="equal")
-    titled(middle, "Cells")
+    set_heading(middle, "Cells")
     for axis in (left, middle):
         axis.set(xticks=[], yticks=[])
     rows = np.arange(shown.pixels.shape[1])
@@ -201,8 +201,8 @@ def clusters(r: Recording) -> Figure:
         right.plot(rows, each.sum(1), color=colours[k], lw=1.2)
         right.text(rows[each.sum(1).argmax()], each.sum(1).max(), str(k), ha="center", va="bottom", size=8)
     right.set(xlabel="row of the region, px", ylabel="correlation with the pilot")
-    titled(right, "Each cluster's pilot, row by row")
-    plain(right)
+    set_heading(right, "Each cluster's pilot, row by row")
+    style_axes(right)
     return figure
 
 
@@ -217,20 +217,20 @@ def symbols(r: Recording) -> Figure:
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(9, 3), width_ratios=(1, 1.6, 1))
     left.bar(range(len(values)), values, color=np.where(values > 0, ON, OFF))
     left.set(xticks=range(len(values)), xlabel="value", ylabel="ON less OFF events")
-    titled(left, f"What cluster {k} showed")
+    set_heading(left, f"What cluster {k} showed")
     score = book.codeword_edges @ values
     symbol = r.frame.soft.symbols[k]
     middle.bar(range(len(score)), score, color="#999999")
     middle.bar([symbol], [score[symbol]], color="#c0272d")
     middle.set(xlabel="symbol", ylabel="correlation")
-    titled(middle, f"Against all codewords: {symbol}")
+    set_heading(middle, f"Against all codewords: {symbol}")
     bits = r.frame.soft.llr[k]
     right.bar(range(len(bits)), bits, color=np.where(bits > 0, "#999999", "#333333"))
     right.axhline(0, color=INK, lw=0.6)
     right.set(xlabel="bit", ylabel="ln P(0) / P(1)")
-    titled(right, f"Its bits: {symbol:06b}")
+    set_heading(right, f"Its bits: {symbol:06b}")
     for axis in (left, middle, right):
-        plain(axis)
+        style_axes(axis)
     return figure
 
 
@@ -243,8 +243,8 @@ def distance(r: Recording) -> Figure:
     peak = phase_only_correlation(images, size, pair, full_band(*size), *shifts)[:, 0]
     left.plot(peak.max(1), ".-", color=INK, lw=0.8, ms=3)
     left.set(xlabel="shift down, px", ylabel="correlation")
-    titled(left, "Phase-only correlation, clusters 2 and 13")
-    plain(left)
+    set_heading(left, "Phase-only correlation, clusters 2 and 13")
+    style_axes(left)
     metres = (20, 35, 50, 65, 80, 95)
     rms: dict[str, list[float]] = defaultdict(list)
     for away in metres:
@@ -269,8 +269,8 @@ def distance(r: Recording) -> Figure:
     right.plot(metres, rms["bound"], color=INK, ls="--", label="bound")
     right.set(yscale="log", xlabel="distance, m", ylabel="RMSE of a frame, m")
     right.legend(frameon=False)
-    titled(right, "Errors and their bound")
-    plain(right)
+    set_heading(right, "Errors and their bound")
+    style_axes(right)
     return figure
 
 

@@ -43,10 +43,10 @@ def diagnose(
     with bytes_bar(Path(recording).name) as advance:
         diagnosis = run(recording, link, registry=registry, advance=advance)
     if out is not None:
-        from evlcp_sdk.report.diagnosis_page import page
+        from evlcp_sdk.report.diagnosis_page import render_diagnosis
 
         with Outputs() as outputs:
-            outputs.write_text(page(diagnosis), out)
+            outputs.write_text(render_diagnosis(diagnosis), out)
             outputs.commit()
     if as_json:
         print_json(diagnosis.to_dict())

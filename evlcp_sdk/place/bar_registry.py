@@ -158,7 +158,6 @@ class BarRegistry:
         return ""
 
     def _match_site(self, number: int) -> BarSite | None:
-        """Find a transmitter's site in the user's list."""
         state = self._states[number]
         link = state.link or self._only_link
         sites = [site for site in self._sites if not link or site.link in (None, link)]

@@ -113,7 +113,6 @@ def _find_level_starts(enu: Floats, directions: Floats, level: Floats) -> list[t
 
 
 def _rotate_about_up(level: Floats, headings: NDArray[np.floating]) -> Floats:
-    """Rotate axes (3, 3) about up, float64 (r, 3, 3)."""
     c, s, zero = np.cos(headings), np.sin(headings), np.zeros(len(headings))
     rows = [[c, -s, zero], [s, c, zero], [zero, zero, zero + 1]]
     return np.moveaxis(np.array(rows), -1, 0) @ level
@@ -135,7 +134,6 @@ def _select_widest_three(points: Floats, seen: Floats, bar: NDArray[np.int64]) -
 
 
 def _sum_squared_angles(points: Floats, seen: Floats, position: Floats, rotation: Floats) -> float:
-    """Sum of the squared angles between the points and the directions in which they are seen."""
     away = points - position
     cosine = (away @ rotation * seen).sum(1) / np.maximum(np.linalg.norm(away, axis=1), 1e-9)
     return float(np.maximum(2 - 2 * cosine, 0.0).sum())
@@ -241,7 +239,6 @@ class Equations:
     """The problem linearized at a state; the camera's and the bars' errors are expected to be 0 to a sigma.
 
     Attributes:
-        problem: The observations.
         state: Where it is linearized.
         rows: Of each point the slopes by its bar's local errors, then by the shared unknowns, and last the
             residual; whitened, float64 (n, 2, 9 + 14 + 1).
@@ -496,7 +493,6 @@ def fit_pose(problem: Problem, start: FitState, steps: int = _STEPS) -> tuple[Eq
 
 
 def _solve_damped(matrix: Floats, side: Floats, damping: float) -> Floats | None:
-    """Solve the damped equations; None where they are singular."""
     damped = matrix.copy()
     damped.flat[:: len(matrix) + 1] *= 1 + damping
     scale = 1 / np.sqrt(np.maximum(np.diag(damped), 1e-300))

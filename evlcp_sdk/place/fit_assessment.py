@@ -364,7 +364,6 @@ def _limit_level(level_m: float, spec: ErrorModel) -> float:
 
 
 def _name_moves(problem: Problem, camera: Floats, attitude: Floats, bars: Floats) -> dict[str, Floats]:
-    """Standing moves, or their slopes, by name."""
     standing = {}
     if problem.free[7]:
         standing["camera"] = camera

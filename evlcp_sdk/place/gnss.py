@@ -49,7 +49,6 @@ def geoid_m(latitude_deg: float, longitude_deg: float) -> float:
 
 @cache
 def _load_geoid() -> NDArray[np.uint16]:
-    """Load the grid, decimetres with 2000 added, uint16 (361, 720)."""
     from PIL import Image
 
     with files("evlcp_sdk.place").joinpath("egm96.png").open("rb") as file, Image.open(file) as picture:

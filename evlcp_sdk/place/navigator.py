@@ -363,7 +363,6 @@ class Navigator:
         return Placed(fix, filtered, self._smooth_oldest(_BLOCK) if len(self._window) == 2 * _BLOCK else ())
 
     def _smooth_oldest(self, count: int) -> tuple[Settled, ...]:
-        """Smooth the window, and drop its first points from it."""
         smoothed = smooth_trajectory([point for _, point, _ in self._window], self._spec)
         settled = tuple(
             Settled(fix, filtered, self._to_place(point))

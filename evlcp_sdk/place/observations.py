@@ -203,7 +203,6 @@ class Problem:
     """All points in one array, all sigmas, and which unknowns there are.
 
     Attributes:
-        camera: The camera.
         attitude: Its attitude as far as it is known; None if it is not.
         spec: Bounds and weights.
         points: A row for each cluster seen: its place in the local axes and from its bar's centre, m, its

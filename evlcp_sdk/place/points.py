@@ -140,6 +140,7 @@ def interpolate_points(
         squares = _PIXEL_FREEDOM * pixel_px**2 + _NEIGHBOUR_FACTOR * misfit_px2
         error_px = max(scatter_across * stated_rms, math.sqrt(squares / (_PIXEL_FREEDOM + freedom)))
         across = max(math.hypot(error_px, timing_px) / along, _LEAST_ACROSS if freedom else 1.0)
+    stretches = [f.range.standing_m / f.range.distance_m for f in nearby if f.range.standing_m]
     return BarView(
         transmitter,
         np.empty((0, 3)),
@@ -150,14 +151,8 @@ def interpolate_points(
         vibration=vibration,
         timing_px=timing_px,
         across=across,
-        stretch=_median_stretch(nearby),
+        stretch=float(np.median(stretches)) if 2 * len(stretches) > len(nearby) else 0.0,
     )
-
-
-def _median_stretch(frames: Sequence[Frame]) -> float:
-    """Sigma of the apparent length of a bar whose image is curved, as a share."""
-    shares = [one.range.standing_m / one.range.distance_m for one in frames if one.range.standing_m]
-    return float(np.median(shares)) if 2 * len(shares) > len(frames) else 0.0
 
 
 def _misfit_across(points: Floats, layout_m: Floats) -> tuple[float, int]:

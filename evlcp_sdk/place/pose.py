@@ -229,7 +229,6 @@ def _find_exchanged_sites(
 
 
 def _fit_and_assess(problem: Problem) -> Pose | Rejection:
-    """The pose by all that is given, whether or not it is to be trusted."""
     fits = fit_from_all_starts(problem)
     if isinstance(fits, Rejection) or not is_misfit(fits[0]):
         return fits if isinstance(fits, Rejection) else _assess_likeliest(fits)

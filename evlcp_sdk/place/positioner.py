@@ -224,7 +224,6 @@ class Positioner:
 
 
 def _to_earth(enu_m: Floats, rotation: Floats, bar_axes: LocalAxes, axes: LocalAxes) -> dict[str, Any]:
-    """Convert a pose in `bar_axes` to the place and angles of a fix."""
     angles = Attitude.of_rotation(rotation)
     latitude, longitude, height = (float(v) for v in bar_axes.to_geodetic(enu_m))
     return {
@@ -239,7 +238,6 @@ def _to_earth(enu_m: Floats, rotation: Floats, bar_axes: LocalAxes, axes: LocalA
 
 
 def _to_alternatives(refusal: Rejection, bar_axes: LocalAxes, axes: LocalAxes) -> tuple[Alternative, ...]:
-    """Convert the candidates of a rejection to alternatives of a fix."""
     turn = axes.rotation_from(bar_axes)
     return tuple(
         Alternative(

@@ -112,7 +112,6 @@ class TrackPoses:
         )
 
     def _find_new_bars(self) -> list[int]:
-        """Transmitters without a known site."""
         known = self._navigator.positioner.bars.known_sites
         return [number for number in self._spans if number not in known]
 

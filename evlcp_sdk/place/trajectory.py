@@ -143,7 +143,6 @@ def _integrate_turn(t_s: Floats, angle: Floats) -> Complex:
 
 
 def _integrate(t_s: Floats, values: NDArray[Any]) -> NDArray[Any]:
-    """Integral from the start to each time, by the trapezoidal rule."""
     area = np.cumsum(np.diff(t_s) * (values[1:] + values[:-1]) / 2)
     return np.concatenate([np.zeros(1, values.dtype), area])
 
@@ -526,7 +525,6 @@ def _add_imu_biases(
 
 
 def _add_causes(point: TrajectoryPoint, new: Sequence[Cause]) -> TrajectoryPoint:
-    """Add causes, of which only their sigmas are known."""
     more, size = sum(cause.size for cause in new), len(point.mean)
     covariance = np.eye(size + more)
     covariance[:size, :size] = point.covariance

@@ -21,5 +21,5 @@ def cluster_colours(clusters: int) -> NDArray[np.float64]:
 
 
 def cluster_hex(clusters: int) -> list[str]:
-    """The same as pages write them, e.g. `#f20d0d`."""
+    """The same as hex strings for pages, e.g. `#f20d0d`."""
     return ["#" + "".join(f"{round(255 * v):02x}" for v in one) for one in cluster_colours(clusters).tolist()]

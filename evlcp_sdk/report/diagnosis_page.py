@@ -1,4 +1,4 @@
-"""One self-contained page of a diagnosis: stages, two maps of the picture, what blinks, what was tried."""
+"""The self-contained page of a diagnosis: stages, two maps of the image, blinking sources, trials."""
 
 import base64
 import io
@@ -19,11 +19,11 @@ _MARKS = {
     "note": ("note", "-"),
     "skip": ("note", "-"),
 }
-"""How a verdict looks, and what is written for it."""
+"""Style and text of each verdict."""
 
 
-def page(diagnosis: Diagnosis) -> str:
-    """The page's HTML."""
+def render_diagnosis(diagnosis: Diagnosis) -> str:
+    """Render the page as HTML."""
     name = Path(diagnosis.recording).name
     height, width = (n * diagnosis.cell_px for n in diagnosis.frequency_hz.shape)
     shown = diagnosis.sources[:_MOST_SOURCES]
@@ -44,8 +44,8 @@ def page(diagnosis: Diagnosis) -> str:
         diagnosis=diagnosis,
         marks=_MARKS,
         steps=[one for one in diagnosis.checks if one.next_step and one.verdict in ("doubt", "fail")],
-        events_png=_png(_events_image(diagnosis.events_map)),
-        frequency_png=_png(_frequency_image(diagnosis.frequency_hz)),
+        events_png=_encode_png(_draw_events(diagnosis.events_map)),
+        frequency_png=_encode_png(_draw_frequencies(diagnosis.frequency_hz)),
         width=width,
         height=height,
         most=_MOST_SOURCES,
@@ -55,28 +55,28 @@ def page(diagnosis: Diagnosis) -> str:
     )
 
 
-def _png(image: NDArray[np.uint8]) -> str:
+def _encode_png(image: NDArray[np.uint8]) -> str:
     from matplotlib.image import imsave
 
-    held = io.BytesIO()
-    imsave(held, image, format="png")
-    return base64.b64encode(held.getvalue()).decode()
+    buffer = io.BytesIO()
+    imsave(buffer, image, format="png")
+    return base64.b64encode(buffer.getvalue()).decode()
 
 
-def _events_image(events: NDArray[np.int64]) -> NDArray[np.uint8]:
-    many = events.sum(-1)
-    level = np.log1p(many) / max(float(np.log1p(many.max(initial=1))), 1e-9)
-    share = (events[..., 1] + 1) / (many + 2)
+def _draw_events(events: NDArray[np.int64]) -> NDArray[np.uint8]:
+    total = events.sum(-1)
+    level = np.log1p(total) / max(float(np.log1p(total.max(initial=1))), 1e-9)
+    share = (events[..., 1] + 1) / (total + 2)
     red = level * np.clip(2 * share, 0.3, 1)
     blue = level * np.clip(2 - 2 * share, 0.3, 1)
     green = level * np.minimum(red, blue) / np.maximum(np.maximum(red, blue), 1e-9)
     return np.asarray(255 * np.stack([red, green, blue], -1), np.uint8)
 
 
-def _frequency_image(frequency_hz: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _draw_frequencies(frequency_hz: NDArray[np.float64]) -> NDArray[np.uint8]:
     from matplotlib import colormaps
 
-    place = np.log(np.nan_to_num(frequency_hz, nan=60.0) / 60.0) / np.log(25_000 / 60.0)
-    image = colormaps["turbo"](np.clip(0.08 + 0.9 * place, 0, 1))[..., :3]
+    position = np.log(np.nan_to_num(frequency_hz, nan=60.0) / 60.0) / np.log(25_000 / 60.0)
+    image = colormaps["turbo"](np.clip(0.08 + 0.9 * position, 0, 1))[..., :3]
     image[np.isnan(frequency_hz)] = 0.07
     return np.asarray(255 * image, np.uint8)

@@ -1,4 +1,4 @@
-"""Charts drawn by Matplotlib, in the style of the house: for papers, and for figures beside a result."""
+"""Charts drawn by Matplotlib in one style: for papers, and for figures beside a result."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,13 +16,13 @@ from evlcp_sdk.report.plots import INK, WIDTHS_PX, Plot, Shape, log_ticks
 INK_COLOUR = "#333333"
 
 
-def titled(axis: Axes, text: str) -> None:
-    """Write a heading: on the left, small."""
+def set_heading(axis: Axes, text: str) -> None:
+    """Set a small heading on the left."""
     axis.set_title(text, loc="left", fontsize=10, color=INK_COLOUR, parse_math=False)
 
 
-def plain(axis: Axes) -> None:
-    """Draw axes without a frame, a pale grid below what is drawn."""
+def style_axes(axis: Axes) -> None:
+    """Style axes: without a frame, with a pale grid behind the data."""
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
     axis.grid(color="#e6e6e6", lw=0.8)
@@ -30,14 +30,14 @@ def plain(axis: Axes) -> None:
 
 
 def draw_plot(plot: Plot, title: str) -> Figure:
-    """Draw a chart, its names below, where no line runs."""
+    """Draw a chart with its legend below."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     axis = figure.subplots()
-    _draw_on(axis, plot)
-    titled(axis, f"{title}: {plot.title}")
+    _draw_axes(axis, plot)
+    set_heading(axis, f"{title}: {plot.title}")
     # A column is as wide as the longest name.
     columns = max(1, min(len(plot.legend), 110 // (8 + max(map(len, plot.legend), default=0))))
-    _name_lines(figure, axis, plot, "outside lower left", columns)
+    _draw_legend(figure, axis, plot, "outside lower left", columns)
     return figure
 
 
@@ -47,19 +47,19 @@ def draw_plots(plots: Sequence[Plot], title: str) -> Figure:
     figure = Figure(figsize=(12, 3.4 * rows), layout="constrained")
     for number, plot in enumerate(plots, 1):
         axis = figure.add_subplot(rows, 2, number)
-        _draw_on(axis, plot)
-        titled(axis, plot.title)
-        _name_lines(axis, axis, plot, "best", 1)
+        _draw_axes(axis, plot)
+        set_heading(axis, plot.title)
+        _draw_legend(axis, axis, plot, "best", 1)
     figure.suptitle(title, fontsize=11, color=INK_COLOUR, parse_math=False)
     return figure
 
 
-def _draw_on(axis: Axes, plot: Plot) -> None:
+def _draw_axes(axis: Axes, plot: Plot) -> None:
     for shape in plot.shapes:
         _draw_shape(axis, shape)
     middle = sum(x for x, _, _ in plot.names) / max(len(plot.names), 1)
     for x, y, text in plot.names:
-        # Outward, as what stands side by side would cover the names of one another.
+        # Outward, so that neighbours do not cover each other's names.
         axis.annotate(
             text, (x, y), xytext=(0, 3), textcoords="offset points", fontsize=8, color=INK_COLOUR,
             ha="right" if x < middle else "left", path_effects=[withStroke(linewidth=3, foreground="white")],
@@ -76,14 +76,13 @@ def _draw_on(axis: Axes, plot: Plot) -> None:
     if plot.aspect is not None:
         axis.set_aspect("equal", adjustable="datalim")
     axis.set(xlabel=plot.x_name, ylabel=plot.y_name)
-    plain(axis)
+    style_axes(axis)
 
 
-def _name_lines(where: Any, axis: Axes, plot: Plot, place: str, columns: int) -> None:
-    """Write what each line is, in a figure or in axes."""
+def _draw_legend(owner: Any, axis: Axes, plot: Plot, location: str, columns: int) -> None:
     if plot.legend:
         handles = [_draw_shape(axis, shape, legend=True) for shape in plot.legend.values()]
-        legend = where.legend(handles, [*plot.legend], loc=place, frameon=False, fontsize=8, ncols=columns)
+        legend = owner.legend(handles, [*plot.legend], loc=location, frameon=False, fontsize=8, ncols=columns)
         for entry in legend.get_texts():
             entry.set_parse_math(False)
 
@@ -101,7 +100,7 @@ def _draw_shape(axis: Axes, shape: Shape, *, legend: bool = False) -> Any:
 
 
 def save_plots(plots: Sequence[Plot], title: str, folder: Path, outputs: Outputs) -> list[Path]:
-    """Draw charts as PNG and SVG, named by their id, into a folder that is made if need be.
+    """Save charts as PNG and SVG, named by their id, in a folder that is created if needed.
 
     Raises:
         OutputError: A file cannot be written.

@@ -1,7 +1,6 @@
-"""Figures of one recording: where the regions were, which pixels show which cluster, distance over time.
+"""Figures of one recording: regions, pixels of each cluster, distance over time.
 
-What is drawn in the end is kept as it comes, a bounded share of it, so that the figures of a recording of
-any length take constant memory.
+A bounded share of the data is kept as it comes, so that recordings of any length take constant memory.
 """
 
 import math
@@ -18,15 +17,15 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import cluster_colours, transmitter_colour
-from evlcp_sdk.report.drawing import INK_COLOUR, draw_plots, plain, titled
+from evlcp_sdk.report.drawing import INK_COLOUR, draw_plots, set_heading, style_axes
 from evlcp_sdk.report.recording import (
-    Kept,
-    Thinned,
+    ChartSink,
+    EvenSample,
     name_transmitter,
     plot_distances,
     plot_positions,
     plot_quality,
-    seconds_since,
+    seconds_axis,
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
@@ -34,27 +33,27 @@ from evlcp_sdk.suggestions import format_count
 from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 _DPI = 150
-_MOST_SHOWN = 3
-_MOST_POINTS, _MOST_REGIONS = 1024, 64
-"""Frames of a transmitter and places of a region, and regions, that are kept."""
+_MOST_TRANSMITTERS = 3
+_MOST_BOXES, _MOST_REGIONS = 1024, 64
+"""Boxes of a region, and regions, that are kept."""
 
 
-class Figures(Kept):
+class Figures(ChartSink):
     """Draws `regions.png`, `presence.png`, `distance.png`, and with positions `track.png`.
 
-    A figure without anything to show is left out.
+    A figure without data is left out.
 
     Attributes:
         image: Events of each pixel, int64 (rows, columns).
-        many_regions: How many regions there were; `regions` has those with the most places.
-        clearest: The frame of each transmitter that is surest, and its presence map.
+        region_count: Number of all regions; `regions` has those with the most boxes.
+        clearest: The frame of best quality of each transmitter, and its presence map.
     """
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
         self.image: NDArray[np.int64] = np.zeros((run.link.camera.height, run.link.camera.width), np.int64)
-        self.regions: dict[int, Thinned[Region]] = {}
-        self.many_regions = 0
+        self.regions: dict[int, EvenSample[Region]] = {}
+        self.region_count = 0
         self.clearest: dict[int, tuple[Frame, PresenceMap]] = {}
         self._presence: PresenceMap | None = None
 
@@ -71,38 +70,34 @@ class Figures(Kept):
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
         """Keep regions, and the clearest frames with their presence maps."""
         if stage == "regions":
-            self._place(value)
+            self._add_region(value)
         elif stage == "separation":
             self._presence = value
         elif stage == "frame" and self._presence is not None:
             best = self.clearest.get(value.transmitter)
-            if (
-                len(self.clearest) < _MOST_SHOWN
-                if best is None
-                else value.soft.quality > best[0].soft.quality
-            ):
+            has_room = best is None and len(self.clearest) < _MOST_TRANSMITTERS
+            if has_room or (best is not None and value.soft.quality > best[0].soft.quality):
                 self.clearest[value.transmitter] = value, self._presence
 
-    def _place(self, region: Region) -> None:
-        """Keep a place of a region, and the regions with the most of them."""
+    def _add_region(self, region: Region) -> None:
         if region.id not in self.regions:
-            self.many_regions += 1
+            self.region_count += 1
             if len(self.regions) == _MOST_REGIONS:
                 del self.regions[min(self.regions, key=lambda number: len(self.regions[number]))]
-            self.regions[region.id] = Thinned(_MOST_POINTS)
+            self.regions[region.id] = EvenSample(_MOST_BOXES)
         self.regions[region.id].add(region)
 
     def finish(self) -> Mapping[str, Any]:
-        """Draw."""
+        """Draw the figures."""
         name = self.run.name
         self._save(draw_regions(self, name), "regions.png")
-        if self.clearest.keys() & self.seen:
+        if self.clearest.keys() & self.transmitters:
             self._save(draw_presence(self, name), "presence.png")
-        if self.seen:
+        if self.transmitters:
             self._save(draw_distance(self, name), "distance.png")
         if self.run.navigator is not None:
             points = [*self.track]
-            plots = plot_positions(points, self.run.navigator.bars_enu_m(), seconds_since(0.0))
+            plots = plot_positions(points, self.run.navigator.bars_enu_m(), seconds_axis(0.0))
             self._save(
                 draw_plots(plots, f"{name}: {format_count(len(points), 'position')} shown"), "track.png"
             )
@@ -113,27 +108,27 @@ class Figures(Kept):
 
 
 def draw_regions(kept: Figures, title: str) -> Figure:
-    """Accumulated events of the whole sensor with the followed regions."""
+    """Draw the accumulated events of the whole sensor with the followed regions."""
     figure = Figure(figsize=(8, 4.8), layout="constrained")
     axis = figure.subplots()
     height, width = kept.image.shape
     top = max(float(np.quantile(kept.image[kept.image > 0], 0.99)) if kept.image.any() else 1.0, 1.0)
     shades = np.log1p(kept.image, dtype=np.float32)
-    # Coloured once, in bytes: Matplotlib would take 80 MB to do so while it draws.
+    # Coloured here, in bytes: Matplotlib would take 80 MB for it.
     picture = colormaps["Greys"](np.clip(shades / np.float32(math.log1p(top)), 0, 1), bytes=True)
     axis.imshow(picture, interpolation="nearest")
     axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="column, px", ylabel="row, px")
-    many = format_count(kept.many_regions, "region")
-    if kept.many_regions > len(kept.regions):
-        many += f", {len(kept.regions)} shown"
-    titled(axis, f"{title}: {kept.image.sum():,} events, {many}")
-    for n, (number, places) in enumerate(sorted(kept.regions.items())):
-        colour = transmitter_colour(n)
+    text = format_count(kept.region_count, "region")
+    if kept.region_count > len(kept.regions):
+        text += f", {len(kept.regions)} shown"
+    set_heading(axis, f"{title}: {kept.image.sum():,} events, {text}")
+    for index, (number, places) in enumerate(sorted(kept.regions.items())):
+        colour = transmitter_colour(index)
         boxes = np.array([(one.x_px, one.y_px, one.width_px, one.height_px) for one in places])
         corners = boxes[:, :2] - boxes[:, 2:] / 2
         (left, upper), (right, lower) = corners.min(0), (corners + boxes[:, 2:]).max(0)
-        size = right - left + 12, lower - upper + 12
-        axis.add_patch(Rectangle((left - 6, upper - 6), *size, fill=False, ec=colour, lw=1.4))
+        box = right - left + 12, lower - upper + 12
+        axis.add_patch(Rectangle((left - 6, upper - 6), *box, fill=False, ec=colour, lw=1.4))
         axis.annotate(
             str(number),
             (right + 6, upper - 6),
@@ -141,27 +136,28 @@ def draw_regions(kept: Figures, title: str) -> Figure:
             textcoords="offset points",
             color=colour,
             va="top",
-            # What sets it apart from what it is written on.
             path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )
     return figure
 
 
 def draw_presence(kept: Figures, title: str) -> Figure:
-    """Which pixels show which cluster, in one frame of each transmitter, and the profile of each cluster."""
-    shown = [kept.clearest[n] for n in sorted(kept.clearest.keys() & kept.seen)]
-    figure = Figure(figsize=(6.4 * len(shown), 7.4), layout="constrained")
-    text = fill(_PRESENCE.format(size=shown[0][1].grid_px), 92 * len(shown))
+    """Draw which pixels show which cluster, in one frame of each transmitter, and the profile of each
+    cluster.
+    """
+    frames = [kept.clearest[n] for n in sorted(kept.clearest.keys() & kept.transmitters)]
+    figure = Figure(figsize=(6.4 * len(frames), 7.4), layout="constrained")
+    text = fill(_PRESENCE_NOTE.format(size=frames[0][1].grid_px), 92 * len(frames))
     figure.supxlabel(text, x=0.02, ha="left", fontsize=9, color=INK_COLOUR)
-    parts = figure.subfigures(1, len(shown), squeeze=False)[0]
-    for part, (frame, presence) in zip(parts, shown, strict=True):
-        number = frame.transmitter
-        _draw_one_presence(part, frame, presence, name_transmitter(number, kept.seen[number].echo_of))
+    parts = figure.subfigures(1, len(frames), squeeze=False)[0]
+    for part, (frame, presence) in zip(parts, frames, strict=True):
+        echo_of = kept.transmitters[frame.transmitter].echo_of
+        _draw_frame_presence(part, frame, presence, name_transmitter(frame.transmitter, echo_of))
     figure.suptitle(f"{title}: which pixels show which cluster", fontsize=11, color=INK_COLOUR)
     return figure
 
 
-_PRESENCE = (
+_PRESENCE_NOTE = (
     "Each cluster of LEDs sends a pilot of its own, by which it is found in the image; a colour is a cluster."
     " Cells: squares of {size} x {size} px that surely show one. Pixels: the cluster whose pilot each pixel"
     " repeats best, the paler the less. Rows: how well each row of pixels repeats each pilot, with the"
@@ -169,7 +165,7 @@ _PRESENCE = (
 )
 
 
-def _draw_one_presence(part: SubFigure, frame: Frame, presence: PresenceMap, who: str) -> None:
+def _draw_frame_presence(part: SubFigure, frame: Frame, presence: PresenceMap, who: str) -> None:
     cells, pixels, profile = part.subplots(1, 3, width_ratios=[1, 1, 1.8], sharey=True)
     colours = cluster_colours(len(presence.probability))
     height, width = presence.pixels.shape[1:]
@@ -182,16 +178,16 @@ def _draw_one_presence(part: SubFigure, frame: Frame, presence: PresenceMap, who
 
     strength = np.where(selected, presence.probability.max(0), 0)
     cells.imshow(
-        _coloured(presence.probability, strength, colours),
+        _colour_pixels(presence.probability, strength, colours),
         extent=(-0.5, columns * size - 0.5, rows * size - 0.5, -0.5),
         interpolation="nearest",
     )
-    titled(cells, "cells")
+    set_heading(cells, "cells")
     signal = np.clip(presence.pixels, 0, None)
     strongest = signal.max(0)
     scale = float(np.quantile(strongest[strongest > 0], 0.9)) if strongest.any() else 1.0
-    pixels.imshow(_coloured(signal, np.clip(strongest / scale, 0, 1), colours), interpolation="nearest")
-    titled(pixels, "pixels")
+    pixels.imshow(_colour_pixels(signal, np.clip(strongest / scale, 0, 1), colours), interpolation="nearest")
+    set_heading(pixels, "pixels")
     for axis in (cells, pixels):
         axis.set(xlim=(left, right), ylim=(lower, upper), xlabel="column, px", aspect="auto")
     cells.set_ylabel("row of the region, px")
@@ -209,26 +205,26 @@ def _draw_one_presence(part: SubFigure, frame: Frame, presence: PresenceMap, who
                 annotation_clip=False,
             )
     profile.set(xlabel="pilot correlation of the row", xlim=(0, None))
-    plain(profile)
-    titled(profile, "rows")
-    # Over the whole part: beside a reflection's number there is no room for the frame's above the rows alone.
+    style_axes(profile)
+    set_heading(profile, "rows")
+    # Over the whole width: a reflection's name leaves no room above the rows alone.
     part.suptitle(
         f"{who}, packet {frame.packet}, frame {frame.frame}", x=0.02, ha="left", fontsize=10, color=INK_COLOUR
     )
 
 
 def draw_distance(kept: Figures, title: str) -> Figure:
-    """Distance of each transmitter, what it is off its neighbours, and quality, over time."""
-    axis = seconds_since(kept.first_us or 0)
-    frames = dict([*kept.frames().items()][:_MOST_SHOWN])
+    """Draw distance and its deviation from neighbours of each transmitter, and quality, over time."""
+    axis = seconds_axis(kept.first_us or 0)
+    frames = dict([*kept.frames().items()][:_MOST_TRANSMITTERS])
     plots = [plot for number, one in frames.items() for plot in plot_distances(number, *one, axis)]
     return draw_plots([*plots, plot_quality(frames, axis)], f"{title}: distance along the optical axis")
 
 
-def _coloured(
+def _colour_pixels(
     clusters: NDArray[np.floating[Any]], strength: NDArray[Any], colours: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Each pixel in its strongest cluster's colour, paler where it is weak: float64 (rows, columns, 3)."""
+    """Colour each pixel by its strongest cluster, paler where that is weak: float64 (rows, columns, 3)."""
     alpha = np.asarray(strength, np.float64)[..., None]
-    mixed: NDArray[np.float64] = colours[np.argmax(clusters, axis=0)] * alpha + (1 - alpha)
-    return mixed
+    colour: NDArray[np.float64] = colours[np.argmax(clusters, axis=0)] * alpha + (1 - alpha)
+    return colour

@@ -1,4 +1,4 @@
-"""A frame in slow motion: the events of each chip, which pixels show which cluster, and what was sent."""
+"""A frame in slow motion: the events of each chip, the cluster of each pixel, and the sent chips."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ _MOST_EVENTS = 4
 """Events of one polarity of a pixel in a chip; more look no brighter."""
 
 _MOST_CELLS = 250_000
-"""Chips times pixels of a picture; of a larger one, pixels are put together."""
+"""Chips times pixels of a picture; in a larger one, pixels are binned."""
 
-_UNSEEN = -1
+_NO_CLUSTER = -1
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A frame with the bar held still, cut to the bar.
+    """A frame with the bar held still, cropped to the bar.
 
     Attributes:
-        frame: What was decoded.
+        frame: The decoded frame.
         sums: Positive minus negative events of each pixel in each chip, int8 (chips, rows, columns), within
             +-4.
         clusters: Cluster that each pixel shows, -1 for none, int16 (rows, columns).
@@ -39,28 +39,28 @@ class Motion:
 
     @classmethod
     def of(cls, frame: Frame, view: FrameView) -> "Motion":
-        """What a view of a frame shows, in bounded size."""
+        """Crop the view of a frame to a bounded size."""
         clusters = cluster_map(view.presence, view.sums.shape[1:])
         rows, columns = np.nonzero(clusters >= 0)
         if len(rows):
             top, left = max(rows.min() - _MARGIN_PX, 0), max(columns.min() - _MARGIN_PX, 0)
-            cut = np.s_[top : rows.max() + _MARGIN_PX + 1, left : columns.max() + _MARGIN_PX + 1]
-            clusters, sums = clusters[cut], view.sums[:, *cut]
+            crop = np.s_[top : rows.max() + _MARGIN_PX + 1, left : columns.max() + _MARGIN_PX + 1]
+            clusters, sums = clusters[crop], view.sums[:, *crop]
         else:
             sums = view.sums
         step = int(np.ceil(np.sqrt(sums.size / _MOST_CELLS)))
         if step > 1:
-            across = [np.arange(0, size, step) for size in clusters.shape]
-            sums = np.add.reduceat(np.add.reduceat(sums, across[0], axis=1), across[1], axis=2)
+            edges = [np.arange(0, size, step) for size in clusters.shape]
+            sums = np.add.reduceat(np.add.reduceat(sums, edges[0], axis=1), edges[1], axis=2)
             clusters = clusters[step // 2 :: step, step // 2 :: step]
             sums = sums[:, : clusters.shape[0], : clusters.shape[1]]
         clipped = np.clip(sums, -_MOST_EVENTS, _MOST_EVENTS).astype(np.int8)
         return cls(frame, clipped, clusters.copy())
 
     def to_dict(self, codebook: Codebook, chip_us: float, ms: Callable[[float], float]) -> dict[str, Any]:
-        """The frame as JSON values, for a page's script; `ms` gives the time that is shown of the clock's."""
+        """The frame as JSON values for a page's script; `ms` converts camera time to the time shown."""
         chips, height, width = self.sums.shape
-        lit = sent_chips(self.frame, codebook)
+        lit = decode_chips(self.frame, codebook)
         rows = [np.nonzero(self.clusters == k)[0] for k in range(len(lit))]
         seen = [(k, float(r.mean())) for k, r in enumerate(rows) if len(r)]
         return {
@@ -82,11 +82,11 @@ class Motion:
         }
 
 
-class MotionProbe:
+class MotionCollector:
     """Keeps the largest frame that is read of some transmitters; listens to the stages.
 
     Args:
-        most: Transmitters of which frames are kept: the first ones.
+        most: Number of transmitters, the first ones.
     """
 
     def __init__(self, most: int = 3) -> None:
@@ -101,47 +101,47 @@ class MotionProbe:
             self._view = value
         elif stage == "frame":
             view, self._view = self._view, None
-            # A frame without a pilot has no view, and shows what its pilot's does.
+            # A frame without a pilot has no view, and looks as the one with its pilot.
             if view is not None and view.soft.symbols.shape == value.soft.symbols.shape:
-                self._keep(value, view)
+                self._keep_clearest(value, view)
 
-    def _keep(self, frame: Frame, view: FrameView) -> None:
+    def _keep_clearest(self, frame: Frame, view: FrameView) -> None:
         last, quality = self._kept.get(frame.transmitter), frame.soft.quality
         if last is None:
-            better = len(self._kept) < self._most
+            is_better = len(self._kept) < self._most
         else:
-            before = last.frame.soft.quality
-            shown = int(view.presence.selected.any(0).sum()) * view.presence.grid_px**2
-            larger = shown > _LARGER * int(np.count_nonzero(last.clusters >= 0))
-            better = before < _CLEAR <= quality or (quality >= min(_CLEAR, before) and larger)
-        if better:
+            old = last.frame.soft.quality
+            area = int(view.presence.selected.any(0).sum()) * view.presence.grid_px**2
+            is_larger = area > _LARGER_RATIO * int(np.count_nonzero(last.clusters >= 0))
+            is_better = old < _CLEAR <= quality or (quality >= min(_CLEAR, old) and is_larger)
+        if is_better:
             self._kept[frame.transmitter] = Motion.of(frame, view)
 
     def motions(self) -> list[Motion]:
-        """What is kept, by transmitter."""
+        """The kept frames, by transmitter."""
         return [self._kept[number] for number in sorted(self._kept)]
 
 
 _CLEAR = 0.5
-"""Quality of a frame that is shown rather than one below."""
+"""Quality of a frame that is preferred to one below."""
 
-_LARGER = 1.1
-"""How much larger an image must be to be shown instead."""
+_LARGER_RATIO = 1.1
+"""Ratio of sizes from which a larger image is preferred."""
 
 
 def cluster_map(presence: PresenceMap, size: tuple[int, ...]) -> NDArray[np.int16]:
-    """Which cluster each pixel shows, int16 (rows, columns) of this size; -1 for none."""
+    """Cluster that each pixel shows, int16 (rows, columns) of this size; -1 for none."""
     selected, grid = presence.selected, presence.grid_px
     strongest = np.where(selected, presence.probability, -1.0).argmax(0).astype(np.int16)
-    cells = np.where(selected.any(0), strongest, np.int16(_UNSEEN))
-    found = np.full(size, _UNSEEN, np.int16)
+    cells = np.where(selected.any(0), strongest, np.int16(_NO_CLUSTER))
+    clusters = np.full(size, _NO_CLUSTER, np.int16)
     pixels = cells.repeat(grid, 0).repeat(grid, 1)[: size[0], : size[1]]
-    found[: pixels.shape[0], : pixels.shape[1]] = pixels
-    return found
+    clusters[: pixels.shape[0], : pixels.shape[1]] = pixels
+    return clusters
 
 
-def sent_chips(frame: Frame, codebook: Codebook) -> NDArray[np.int8]:
-    """What each cluster sent in a frame with a pilot, by what was decoded.
+def decode_chips(frame: Frame, codebook: Codebook) -> NDArray[np.int8]:
+    """Chips that each cluster sent in a frame with a pilot, by the decoded symbols.
 
     Returns:
         1 for light, 0 for none, -1 where the symbol is not given; int8 (K, chips).

@@ -1,7 +1,7 @@
-"""`report.html`: a recording on one page, which opens anywhere, asks no network, and is read on a phone, too.
+"""`report.html`: a recording on one page, which opens anywhere without a network, also on a phone.
 
-What is shown is kept as it comes, a bounded share of it, so that a recording of any length takes constant
-memory; all frames are in `frames.csv`, all messages in `packets.jsonl`.
+A bounded share of the data is kept as it comes, so that recordings of any length take constant memory; all
+frames are in `frames.csv`, all messages in `packets.jsonl`.
 """
 
 from collections import deque
@@ -14,18 +14,18 @@ import numpy as np
 from evlcp_sdk.diagnosis.facts import Diagnostic
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import transmitter_colour
-from evlcp_sdk.report.motion import MotionProbe
+from evlcp_sdk.report.motion import MotionCollector
 from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.report.plots import SCRIPT, Plot
 from evlcp_sdk.report.recording import (
-    Kept,
+    ChartSink,
     TimeAxis,
     label_frames,
     name_transmitter,
     plot_distances,
     plot_positions,
     plot_quality,
-    seconds_since,
+    seconds_axis,
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
@@ -33,44 +33,44 @@ from evlcp_sdk.suggestions import format_count
 from evlcp_sdk.values import Frame, Packet, ReceivedMessage
 
 _MOST_MESSAGES = 50
-_MOST_SAID = 2_000
+_MOST_TEXT = 2_000
 
-_SECONDS = 5.0
-"""Length of a recording whose charts count in seconds."""
+_LONG_S = 5.0
+"""Duration of a recording from which on its charts are in seconds."""
 
 
-class Report(Kept):
+class Report(ChartSink):
     """Writes `report.html`."""
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
-        self._motion = MotionProbe(3 * max(len(run.links), 1))
+        self._motion = MotionCollector(3 * max(len(run.links), 1))
         self._messages: list[ReceivedMessage] = []
         self._latest: deque[ReceivedMessage] = deque(maxlen=_MOST_MESSAGES)
-        self._many_messages = 0
+        self._message_count = 0
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
-        """Keep what frames look like."""
+        """Keep frames in slow motion."""
         self._motion.evlcp_stage_finished(stage, value)
 
     def packet(self, packet: Packet) -> None:
         """Keep frames and messages."""
         super().packet(packet)
         for message in packet.messages:
-            self._many_messages += 1
+            self._message_count += 1
             (self._messages if len(self._messages) < _MOST_MESSAGES else self._latest).append(message)
 
     def conclude(self, summary: Mapping[str, Any]) -> None:
-        """Write the page, which is the same for the same recording: how long it took is not in it."""
+        """Write the page, the same for the same recording."""
         axis = TimeAxis("ms since the first event", self.first_us or 0, 1.0)
-        if summary["recording"]["duration_s"] > _SECONDS:
-            axis = seconds_since(axis.zero_us)
+        if summary["recording"]["duration_s"] > _LONG_S:
+            axis = seconds_axis(axis.zero_us)
         motions = [
             motion.to_dict(link.codebook, link.packet.chip_us, axis.ms)
             for motion in self._motion.motions()
-            # What another link fitted better is not given.
-            if motion.frame.transmitter in self.seen or not self.run.links
+            # Transmitters that another link fitted better are not given.
+            if motion.frame.transmitter in self.transmitters or not self.run.links
             for link in [self.run.link_of(motion.frame.link)]
         ]
         frames = self.frames()
@@ -79,11 +79,11 @@ class Report(Kept):
         places = None
         if navigator is not None:
             places = plot_positions([*self.track], navigator.bars_enu_m(), axis)
-        of_frames = [*distances, plot_quality(frames, axis), self._plot_places(frames, axis)]
-        plots = of_frames * bool(self.seen) + (places or [])
+        frame_plots = [*distances, plot_quality(frames, axis), self._plot_places(frames, axis)]
+        plots = frame_plots * bool(self.transmitters) + (places or [])
         messages = [*self._messages, *self._latest]
-        # Its labels are known once a chart is drawn.
-        held = {plot.id: plot.markup() for plot in plots}
+        # Labels exist once a chart is drawn.
+        charts = {plot.id: plot.to_markup() for plot in plots}
         page = render_page(
             "recording.html",
             f"{self.run.name}: report",
@@ -91,16 +91,16 @@ class Report(Kept):
             {"plots": {plot.id: plot.labels for plot in plots}, "report": {"motions": motions}},
             name=self.run.name,
             summary=summary,
-            figures=self._headline(summary),
+            figures=self._headline_figures(summary),
             warnings=[Diagnostic(**one) for one in summary["warnings"]],
             notes=[Diagnostic(**one) for one in summary["notes"]],
             counts={name: value for name, value in summary["counts"].items() if value},
             motions=motions,
-            held=held,
+            charts=charts,
             distances=distances,
-            seen=self.seen,
-            received=sum(seen.count for seen in self.seen.values()),
-            shown=sum(len(seen.frames) for seen in self.seen.values()),
+            transmitters=self.transmitters,
+            received=sum(one.count for one in self.transmitters.values()),
+            shown=sum(len(one.frames) for one in self.transmitters.values()),
             places=places,
             placed=len(self.track) > 0,
             messages=[
@@ -109,41 +109,41 @@ class Report(Kept):
                     m.kind.name,
                     m.message.transmitter_id,
                     m.trust,
-                    m.summary(_MOST_SAID),
+                    m.summary(_MOST_TEXT),
                 )
                 for m in messages
             ],
-            left_out=self._many_messages - len(messages),
+            left_out=self._message_count - len(messages),
             axis=axis,
-            books={number: self.run.link_of(seen.link).codebook for number, seen in self.seen.items()},
+            books={number: self.run.link_of(one.link).codebook for number, one in self.transmitters.items()},
             name_transmitter=name_transmitter,
             counted=format_count,
         )
         self.folder.open("report.html").write(page)
 
-    def _headline(self, summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-        """The figures that a reader looks for first: what each is, its value, and a note."""
+    def _headline_figures(self, summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         recording = summary["recording"]
-        own = [t for t in summary["transmitters"] if t["echo_of"] is None]
-        given = sum(t["symbols_given"] for t in own)
-        found, expected = (sum(t[key] for t in own) for key in ("frames_found", "frames_expected"))
+        bars = [t for t in summary["transmitters"] if t["echo_of"] is None]
+        given = sum(t["symbols_given"] for t in bars)
+        found, expected = (sum(t[key] for t in bars) for key in ("frames_found", "frames_expected"))
         figures = [("frames", f"{found:,}", f"of {expected:,} sent" if found else "")]
         if found:
-            erased = sum(t["symbols_erased"] for t in own)
+            erased = sum(t["symbols_erased"] for t in bars)
             bits = sum(
-                t["symbols_given"] * self.run.link_of(t.get("link", "")).codebook.bits_per_symbol for t in own
+                t["symbols_given"] * self.run.link_of(t.get("link", "")).codebook.bits_per_symbol
+                for t in bars
             )
-            not_seen = f"{erased / (given + erased):.1%} of symbols not given" if erased else ""
-            quality = sum(t["quality"] * t["frames_found"] for t in own) / found
+            erased_note = f"{erased / (given + erased):.1%} of symbols not given" if erased else ""
+            quality = sum(t["quality"] * t["frames_found"] for t in bars) / found
             figures += [
-                ("bits", f"{bits:,}", not_seen),
+                ("bits", f"{bits:,}", erased_note),
                 ("quality", f"{quality:.1%}", "of frames expected to be right"),
             ]
-        figures += _distances(own)
+        figures += _distance_figures(bars)
         if len(summary["transmitters"]) > 1:
-            echoes = len(summary["transmitters"]) - len(own)
+            echoes = len(summary["transmitters"]) - len(bars)
             note = f"and {echoes} reflection{'s' * (echoes != 1)}" if echoes else ""
-            figures.append(("transmitters", str(len(own)), note))
+            figures.append(("transmitters", str(len(bars)), note))
         if summary["messages_off"] is None:
             figures.append(("messages", f"{summary['counts'].get('messages', 0):,}", ""))
         if "positions" in summary:
@@ -156,7 +156,6 @@ class Report(Kept):
         return figures
 
     def _plot_places(self, shown: Mapping[int, tuple[str, Sequence[Frame]]], axis: TimeAxis) -> Plot:
-        """Where in the image transmitters are."""
         camera = self.run.link.camera
         image = Plot(
             "image",
@@ -167,22 +166,22 @@ class Report(Kept):
             x_limits=(0, camera.width),
             y_limits=(0, camera.height),
         )
-        for number, (who, frames) in shown.items():
+        for number, (name, frames) in shown.items():
             places = np.array([(frame.x_px, frame.y_px) for frame in frames])
-            labels = label_frames(who, frames, axis)
-            image.dots(places[:, 0], places[:, 1], transmitter_colour(number), who, labels)
+            labels = label_frames(name, frames, axis)
+            image.add_dots(places[:, 0], places[:, 1], transmitter_colour(number), name, labels)
             if len(frames) and np.isfinite(places[-1]).all():
-                image.name(float(places[-1, 0]), float(places[-1, 1]), str(number))
+                image.add_name(float(places[-1, 0]), float(places[-1, 1]), str(number))
         return image
 
 
-def _distances(own: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
-    """From where to where transmitters are, and how often; nothing where no frame says so."""
-    distances = [t[key] for t in own for key in ("distance_first_m", "distance_last_m")]
+def _distance_figures(transmitters: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
+    """Range of distances of the transmitters, and their number; empty if no frame has one."""
+    distances = [t[key] for t in transmitters for key in ("distance_first_m", "distance_last_m")]
     distances = [d for d in distances if d is not None]
     if not distances:
         return []
-    shown = f"{distances[0]:.2f} to {distances[-1]:.2f} m"
-    if len(own) > 1:
-        shown = f"{min(distances):.1f} to {max(distances):.1f} m"
-    return [("distance", shown, f"{sum(t['frames_ranged'] for t in own):,} frames have one")]
+    text = f"{distances[0]:.2f} to {distances[-1]:.2f} m"
+    if len(transmitters) > 1:
+        text = f"{min(distances):.1f} to {max(distances):.1f} m"
+    return [("distance", text, f"{sum(t['frames_ranged'] for t in transmitters):,} frames have one")]

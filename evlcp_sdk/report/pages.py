@@ -1,7 +1,7 @@
-"""Self-contained pages of Jinja2 templates: nothing in them asks the network.
+"""Self-contained pages of Jinja2 templates: nothing in them needs the network.
 
-What is not `Markup` is plain text and is escaped where it enters a page, whatever wrote it; and a page lets
-no script run but those that it was written with.
+Text that is not `Markup` is escaped where it enters a page; and a page runs only the scripts that it was
+written with.
 """
 
 import base64
@@ -35,36 +35,36 @@ def render_page(
     connect: bool = False,
     **values: Any,
 ) -> str:
-    """A whole page.
+    """Render a whole page.
 
     Args:
         template: Name of a template that extends `base.html`, or one itself.
         title: Plain text.
-        scripts: JavaScript, run in this order once the body is there; written by us, nothing of it by others.
-        data: What the scripts read, as JSON: name to values. The text of the script element with the id
-            `name` is the JSON of its values.
-        connect: Scripts may talk to the server that the page comes from.
-        values: What the template shows beside.
+        scripts: JavaScript, run in this order once the body is there; ours alone.
+        data: For the scripts, as JSON: name to values. The script element with the id `name` has the JSON of
+            its values as text.
+        connect: Whether scripts may connect to the server that the page comes from.
+        values: Further values for the template.
 
     Raises:
-        ValueError: A script holds what would end its element.
+        ValueError: A script contains the end of its element.
     """
-    held, sources = [], []
+    markups, sources = [], []
     for script in scripts:
         if re.search("</script", script, re.IGNORECASE):
             raise ValueError("a script that would end its own element")
-        # As a browser reads it.
+        # As a browser normalizes it.
         script = script.replace("\r\n", "\n").replace("\r", "\n")
         digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
         sources.append(f"'sha256-{digest}'")
-        held.append(Markup(script))
+        markups.append(Markup(script))
     policy = (
         "default-src 'none'; img-src data: blob:; base-uri 'none'; form-action 'none';"
-        # Charts style themselves.
+        # Charts have inline styles.
         + (" connect-src 'self';" if connect else "")
         + " style-src 'unsafe-inline'; script-src "
         + (" ".join(sources) or "'none'")
     )
     return TEMPLATES.get_template(template).render(
-        title=title, policy=Markup(policy), scripts=held, data=data or {}, **values
+        title=title, policy=Markup(policy), scripts=markups, data=data or {}, **values
     )

@@ -222,12 +222,10 @@ def _average_rows(
 
 
 def _pixels_from_middle(pixels: int) -> Array:
-    """Pixel coordinates from the image's middle, px."""
     return np.arange(pixels, dtype=np.float64) - (pixels - 1) / 2
 
 
 def _value_times(values: int) -> Array:
-    """Times of the values from the frame's middle, in frames."""
     return np.arange(values, dtype=np.float64) / values - 0.5
 
 

@@ -133,8 +133,6 @@ class _StageTimer:
 
 
 class _VariantRun:
-    """A variant's receiver, its frames and its time."""
-
     def __init__(self, links: Mapping[str, Link]) -> None:
         self.timer = _StageTimer()
         self.links = links
@@ -227,7 +225,6 @@ def _time_chunks(chunks: Iterator[Events], stopwatch: Stopwatch) -> Iterator[Eve
 
 
 def _warm_up(source: EventSource, variants: Sequence[Variant]) -> None:
-    """Receive the first packets with every variant."""
     runs = [_VariantRun(variant.links) for variant in variants]
     packets = [link.packet for variant in variants for link in variant.links.values()]
     enough_us = _WARM_PACKETS * max(packet.packet_chips * packet.chip_us for packet in packets)

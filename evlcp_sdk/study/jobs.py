@@ -187,7 +187,6 @@ def stop_workers() -> None:
 
 
 def _run_job(function: Callable[[J], R], job: J) -> Outcome[J, R]:
-    """Run one job; an exception becomes a fault."""
     try:
         return Outcome(job, function(job))
     except (Exception, SystemExit) as fault:

@@ -71,7 +71,6 @@ class SentFrames:
     """The frames that a bar sent whole while the recording ran.
 
     Attributes:
-        bar: The bar.
         start_us: Start of each after the scene's, us, float64 (n,).
         cut_us: Start of those that are hidden completely, or cut by an end of the recording, us.
         symbols: Symbols of each, int64 (n, clusters).

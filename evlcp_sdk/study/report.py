@@ -77,7 +77,7 @@ def draw_charts(summary: Summary) -> list[Plot]:
     for reference in PAPER:
         _draw_reference(by_kind[reference.measure], reference)
     *by_distance, positions = by_kind.values()
-    return [*by_distance, histogram, *([] if positions.empty else [positions])]
+    return [*by_distance, histogram, *([] if positions.is_empty else [positions])]
 
 
 def _label_key(series: Series, prefix: str) -> str:
@@ -102,11 +102,11 @@ def _draw_segments(plot: Plot, series: Series, kind: str, shift: float, colour: 
         left, right, tip, wing = x - SEGMENT_M / 16, x + SEGMENT_M / 16, y / _ARROW, y / _ARROW**0.8
         arrow = [x, x, left, x, right], [y, tip, wing, tip, wing]
         stems.append(arrow if is_limit else ([x, x], [figure.low, figure.high]))
-    plot.line(xs, dots, colour, series.name, dash)
-    plot.dots(xs, dots, colour, series.name)
-    plot.label(xs, ys, labels, series.name)
+    plot.add_line(xs, dots, colour, series.name, dash)
+    plot.add_dots(xs, dots, colour, series.name)
+    plot.add_labels(xs, ys, labels, series.name)
     for stem_x, stem_y in stems:
-        plot.line(stem_x, stem_y, colour, series.name, dash, kind="stem")
+        plot.add_line(stem_x, stem_y, colour, series.name, dash, kind="stem")
 
 
 def _find_spans(series: Series, kind: str) -> list[tuple[int, int]]:
@@ -130,7 +130,6 @@ def _find_spans(series: Series, kind: str) -> list[tuple[int, int]]:
 
 
 def _interval_text(figure: Figure) -> str:
-    """Describe the ends of an error bar."""
     if math.isnan(figure.high):
         return "one recording: no interval"
     few = figure.recordings < FEWEST_RECORDINGS and not figure.is_zero
@@ -139,7 +138,6 @@ def _interval_text(figure: Figure) -> str:
 
 
 def _draw_bins(plot: Plot, series: Series, colour: str, dash: Dash) -> None:
-    """Draw the outline of a histogram."""
     tally = series.statistics.total()
     if not tally.ranged:
         return
@@ -148,16 +146,15 @@ def _draw_bins(plot: Plot, series: Series, colour: str, dash: Dash) -> None:
     shares = [counts.get(bin, 0) / tally.ranged for bin in bins]
     edges = [bin * BIN_M for bin in (*bins, bins[-1] + 1)]
     x, y = ([value for value in values for _ in (0, 1)] for values in (edges, shares))
-    plot.line(x[1:-1], y, colour, series.name, dash)
+    plot.add_line(x[1:-1], y, colour, series.name, dash)
     labels = [
         f"{series.name}\n{low:+.2f} to {low + BIN_M:+.2f} m: {counts.get(bin, 0)} of {tally.ranged}"
         for bin, low in zip(bins, edges, strict=False)
     ]
-    plot.label([low + BIN_M / 2 for low in edges[:-1]], shares, labels, series.name)
+    plot.add_labels([low + BIN_M / 2 for low in edges[:-1]], shares, labels, series.name)
 
 
 def _draw_reference(plot: Plot, reference: Reference) -> None:
-    """Draw a figure of the paper as a level, with its value above."""
     clusters, speed_kmh = reference.clusters, reference.speed_kmh
     parts = [f"{clusters} cluster{'s' * (clusters != 1)}"] if clusters and speed_kmh else []
     parts += [f"{speed_kmh:g} km/h"] if speed_kmh else ["20 to 40 km/h"]
@@ -165,9 +162,9 @@ def _draw_reference(plot: Plot, reference: Reference) -> None:
     text = f"{'at most ' * reference.bound}{reference.value:g}"
     x = [reference.from_m, (reference.from_m + reference.to_m) / 2, reference.to_m]
     y = [reference.value] * 3
-    plot.line(x, y, INK, name, DASHES[1] if clusters == 2 else (), "level")
-    plot.label(x, y, [f"{name}\n{x[0]:g} to {x[2]:g} m: {text}"] * 3, name)
-    plot.name(reference.from_m, reference.value, text + (f" ({clusters})" if clusters else ""))
+    plot.add_line(x, y, INK, name, DASHES[1] if clusters == 2 else (), "level")
+    plot.add_labels(x, y, [f"{name}\n{x[0]:g} to {x[2]:g} m: {text}"] * 3, name)
+    plot.add_name(reference.from_m, reference.value, text + (f" ({clusters})" if clusters else ""))
 
 
 def render_campaign(summary: Summary) -> str:
@@ -178,7 +175,7 @@ def render_campaign(summary: Summary) -> str:
         return Markup('<span class="{}">{}</span>').format(_VERDICT_CLASSES[verdict], verdict)
 
     # Labels exist once a chart is drawn.
-    drawn = [(chart, chart.markup()) for chart in charts]
+    drawn = [(chart, chart.to_markup()) for chart in charts]
     rule = summary.plan.rule
     return render_page(
         "campaign.html",
@@ -203,7 +200,6 @@ def render_campaign(summary: Summary) -> str:
 
 
 def _progress_text(summary: Summary) -> str:
-    """Amount of work done, in words."""
     is_partial = summary.done < summary.tasks
     done = f"{summary.done} of {summary.tasks} tasks" if is_partial else format_count(summary.done, "task")
     statistics = [one.statistics for one in summary.series]
@@ -319,7 +315,6 @@ def _figure_text(recordings: Sequence[Tally], kind: str, form: str) -> str:
 
 
 def _describe_cases(summary: Summary) -> Iterator[tuple[str, Any]]:
-    """Name and identity of each scene and link."""
     for kind, cases in (("scene", summary.plan.scenes), ("link", summary.plan.links)):
         for case in cases:
             labels = ", ".join(f"{k} {v}" for k, v in case.labels.items()) or "the only one"

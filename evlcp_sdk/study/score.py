@@ -54,7 +54,6 @@ def _score_bars(
 
 
 def _bar_figures(bar: Statistics, *, road: bool) -> dict[str, Any]:
-    """Figures of one bar, rounded; None where nothing was measured."""
     tally = bar.total()
     # A symbol that is not given counts as all bits wrong, or not at all.
     erased = 0 if road else tally.erased_bits

@@ -191,6 +191,7 @@ class Tally:
         {-3: 1}
         """
         error_nm = to_nm(error_m)
+        sigmas = min(abs(error_m / sigma_m), _MOST_SIGMAS) if sigma_m else _MOST_SIGMAS
         bin = max(-_FARTHEST_BIN, min(_FARTHEST_BIN, error_nm // to_nm(BIN_M)))
         return cls(
             ranged=1,
@@ -199,7 +200,7 @@ class Tally:
             gross=int(abs(error_m) >= HALF_METRE_M),
             worst_nm=abs(error_nm),
             with_sigma=int(not math.isnan(sigma_m)),
-            nees_micro=0 if math.isnan(sigma_m) else _nees_micro(_error_sigmas(error_m, sigma_m) ** 2),
+            nees_micro=0 if math.isnan(sigma_m) else _nees_micro(sigmas**2),
             histogram={bin: 1},
         )
 
@@ -340,10 +341,6 @@ class Tally:
             if seen >= share * self.fixes:
                 return (bin + 1) * POSITION_BIN_M
         return math.nan
-
-
-def _error_sigmas(error: float, sigma: float) -> float:
-    return min(abs(error / sigma), _MOST_SIGMAS) if sigma else _MOST_SIGMAS
 
 
 def _nees_micro(nees: float) -> int:

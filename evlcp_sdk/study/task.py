@@ -61,7 +61,6 @@ def plan_campaign(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
 
 
 def _set_campaign_link(scene: Scene, table: Mapping[str, Any]) -> Scene:
-    """Set the campaign's link for bars of the scene without a link of their own."""
     link = {section: table[section] for section in _ON_AIR if section in table}
     bars = (replace(bar, link=link) if bar.link is None else bar for bar in scene.bars)
     return scene if scene.link is not None else replace(scene, bars=tuple(bars))

@@ -81,9 +81,9 @@ def test_many_regions_and_transmitters_keep_a_bounded_share(figures: Figures) ->
         for i in range(6 if number < 4 else 1):
             figures.evlcp_stage_finished("regions", Region(number, 1000.0 * i, 100.0, 200.0, 6.0, 80.0))
     assert set(figures.regions) >= {0, 1, 2, 3}
-    assert (len(figures.regions), figures.many_regions) == (64, 300)
+    assert (len(figures.regions), figures.region_count) == (64, 300)
     show(figures, 40, 2)
-    assert (sorted(figures.seen), sorted(figures.clearest)) == ([*range(6)], [*range(3)])
-    assert f"{figures.many_regions} regions, 64 shown" in draw_regions(figures, "many").axes[0].get_title(
+    assert (sorted(figures.transmitters), sorted(figures.clearest)) == ([*range(6)], [*range(3)])
+    assert f"{figures.region_count} regions, 64 shown" in draw_regions(figures, "many").axes[0].get_title(
         "left"
     )

@@ -12,7 +12,7 @@ from PIL import Image
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.io import write_events
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.report.film import Film, Footage, draw_film, pictures_of, plan_film, save_film
+from evlcp_sdk.report.film import Film, Footage, count_pictures, draw_film, plan_film, save_film
 from evlcp_sdk.run import film
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Frame, Range, Region, SoftSymbols
@@ -93,7 +93,7 @@ def test_what_is_shown_holds_the_bars_and_stays_in_the_image() -> None:
     for all_of_it in (plan(), plan(frame_at(640, 360), whole=True)):
         assert (all_of_it.left, all_of_it.top) == (0, 0)
         assert (all_of_it.columns, all_of_it.rows) == (camera.width, camera.height)
-    assert plan().pictures == pictures_of(20, 400) == 20e-3 * 400 * 25
+    assert plan().pictures == count_pictures(20, 400) == 20e-3 * 400 * 25
 
 
 def test_a_film_of_a_recording(evlcp: Callable[..., Any], demo_raw: Path, tmp_path: Path) -> None:

@@ -150,8 +150,8 @@ def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) ->
                 for k in range(10)
             )
             sink.packet(Packet(n % 9, n, 34e3 * n, 100.0, frames, 10))
-        assert len(sink.seen) == 6
-        assert all(len(seen.frames) <= 512 and len(seen.first) == 40 for seen in sink.seen.values())
+        assert len(sink.transmitters) == 6
+        assert all(len(seen.frames) <= 512 and len(seen.first) == 40 for seen in sink.transmitters.values())
     page = (tmp_path / "report.html").read_text()
     assert len(page) < 1_500_000
     assert re.search(r"[\d,]+ of 26,6\d0 frames are shown", page)
@@ -159,7 +159,7 @@ def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) ->
 
 def test_what_others_wrote_stays_text(tmp_path: Path) -> None:
     with open_report(tmp_path, HOSTILE) as sink:
-        sink._many_messages = 101
+        sink._message_count = 101
         output: Any = SimpleNamespace(
             t_us=1e3,
             kind=SimpleNamespace(name=HOSTILE),

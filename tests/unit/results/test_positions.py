@@ -27,7 +27,7 @@ from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.trajectory import step_trajectory
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.report.recording import plot_positions, seconds_since
+from evlcp_sdk.report.recording import plot_positions, seconds_axis
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.geojson import GeoJson
 from evlcp_sdk.results.nmea import Nmea
@@ -275,7 +275,7 @@ def test_the_figure_of_a_track() -> None:
     way = Navigator(LINK, PositionPlan((SITE,)), ATTITUDE)
     way.feed(packets(13))
     _, settled = way.close()
-    _, close, *_ = plot_positions(settled, way.bars_enu_m(), seconds_since(0.0))
+    _, close, *_ = plot_positions(settled, way.bars_enu_m(), seconds_axis(0.0))
     ring = next(shape for shape in close.shapes if shape.kind == "ring")
     # Drawn larger by as much as the legend says.
     label = ring.name
@@ -331,7 +331,7 @@ def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:
     assert found[0]["detail"]
     assert rows_of(tmp_path / "track.csv") == []
     assert sentences(tmp_path)[0].gps_qual == 0
-    assert plot_positions([], {}, seconds_since(0.0)) == []
+    assert plot_positions([], {}, seconds_axis(0.0)) == []
 
 
 def test_a_long_track_is_smoothed_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
