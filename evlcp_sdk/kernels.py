@@ -47,7 +47,7 @@ class CompileTimer:
         compile_: Callable[[Any], Any] = kernel.compile
 
         @wraps(compile_)
-        def timed_compile(sig: Any) -> Any:
+        def compile_and_time(sig: Any) -> Any:
             start = time.process_time(), time.perf_counter()
             compiled = sum(kernel.stats.cache_misses.values())
             self._depth += 1
@@ -73,7 +73,7 @@ class CompileTimer:
                             f"compiling kernels, once on a machine: {count_compiled()} of {count_imported()}"
                         )
 
-        return timed_compile
+        return compile_and_time
 
 
 COMPILE_TIMER = CompileTimer()
@@ -144,7 +144,7 @@ def njit(function: Any = None, /, **options: Any) -> Any:
     return (lambda f: _Kernel(f, all_options)) if function is None else _Kernel(function, all_options)
 
 
-def _loaded_kernels() -> Iterator[Any]:
+def _find_kernels() -> Iterator[Any]:
     """The kernels of modules of which one has been called."""
     for name, module in list(sys.modules.items()):
         if name.endswith("_kernels"):
@@ -154,14 +154,14 @@ def _loaded_kernels() -> Iterator[Any]:
 
 def count_imported() -> int:
     """How many kernels this process has loaded; most of them will be called."""
-    return sum(1 for _ in _loaded_kernels())
+    return sum(1 for _ in _find_kernels())
 
 
 def count_compiled() -> int:
     """How many kernels this process has compiled."""
-    return sum(sum(kernel.stats.cache_misses.values()) for kernel in _loaded_kernels())
+    return sum(sum(kernel.stats.cache_misses.values()) for kernel in _find_kernels())
 
 
 def find_cache_folder() -> Path | None:
     """The folder of the kernels loaded first; None where none can be written."""
-    return next((Path(k.stats.cache_path) for k in _loaded_kernels() if k.stats.cache_path is not None), None)
+    return next((Path(k.stats.cache_path) for k in _find_kernels() if k.stats.cache_path is not None), None)

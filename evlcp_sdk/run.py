@@ -1,7 +1,6 @@
-"""The use cases: what a program does with a recording, and what the commands parse and print.
+"""The use cases as functions, for programs and for the commands.
 
-What computes positions and what is live take a tenth of a start; they are imported by the functions that use
-them.
+Positions and live runs take a tenth of a start to import, so only the functions that use them do.
 """
 
 from __future__ import annotations
@@ -54,15 +53,15 @@ if TYPE_CHECKING:
     from evlcp_sdk.scene.sites import BarSite, LocalAxes
 
 Advance = Callable[[int, int | None], None]
-"""Called after each piece with the bytes that are done, and of how many if that is known."""
+"""Called after each piece with the bytes that are read, and of how many if that is known."""
 
 
-def _say_nothing(_done: int, _of: int | None) -> None:
-    """Who asks for no progress."""
+def _ignore_progress(_done: int, _of: int | None) -> None:
+    """The `Advance` of a caller who wants no progress."""
 
 
-DEGRADED_SHARE, DEGRADED_LEAST = 0.01, 100
-"""Share, and number, of events and words dropped from which on a result is `degraded`."""
+_DEGRADED_SHARE, _MIN_DEGRADED = 0.01, 100
+"""Share and number of dropped events and words above which a result is `degraded`."""
 
 
 def receive(
@@ -76,17 +75,17 @@ def receive(
 ) -> Reception:
     """Receive a recording or a camera: an iterator over its packets, in constant memory.
 
-    The packets that the stream's end completes come, too, and the source is closed behind the last one.
+    This includes packets that the end of the stream completes; then the source is closed.
 
     Args:
-        source: What to open, plugins asked first; or a source that is open, which is read on and closed.
+        source: What to open, plugins asked first; or an open source, which is read on and closed.
         link: The configuration, or a `link.toml`, or several of these; None for all defaults.
         registry: Plugins whose hooks are called; None for all that are installed.
-        attitude: What is known of the camera's attitude, the same always or over time: how plumb bars lean
-            against the sensor. None for nothing.
-        clock_zero: UTC of the camera clock's 0, or pulses on its trigger input that say it (a `PulseClock`
-            for each recording), for the age of signed beacons; None if it is not known.
-        workers: Processes at work, see `Receiver`.
+        attitude: The camera's attitude, constant or over time, which gives the tilt of plumb bars against the
+            sensor; None where it is not known.
+        clock_zero: UTC of the camera clock's 0, or pulses on its trigger input that give it (a `PulseClock`
+            for each recording), for the age of signed beacons; None where it is not known.
+        workers: Number of processes, see `Receiver`.
 
     Raises:
         InputError: The source cannot be opened.
@@ -97,21 +96,21 @@ def receive(
     links = load_links(link, registry=registry)
     with ExitStack() as stack:
         opened = stack.enter_context(open_until_stopped(source, registry, never_stop))
-        pulses = _check_source(opened, _name_of(source, opened), links, clock_zero)
+        pulses = _check_source(opened, _source_name(source, opened), links, clock_zero)
         receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero, workers=workers)
         stack.pop_all()
     return Reception(opened, receiver, links[0], pulses)
 
 
-def _name_of(source: EventSource | str | Path, opened: EventSource) -> str:
-    """What messages and the summary call a source."""
+def _source_name(source: EventSource | str | Path, opened: EventSource) -> str:
+    """The name of a source in messages and the summary."""
     return str(opened.path if isinstance(source, EventSource) or source == STDIN else source)
 
 
 def _check_source(
     source: EventSource, url: str, links: Sequence[Link], clock_zero: ClockZero
 ) -> PulseClock | None:
-    """What is told of a source's triggers; None for nobody.
+    """Check a source; return the pulses that take its triggers, or None.
 
     Raises:
         ConfigError: Its sensor is not the links', or nothing says which second of UTC its pulses begin.
@@ -127,10 +126,10 @@ def _check_source(
     return clock_zero
 
 
-def _events_of(
+def _read_events(
     source: EventSource, pulses: PulseClock | None, stopped: Stopped = never_stop
 ) -> Iterator[Events]:
-    """The events of a source; its triggers go to the pulses before the events that came with them."""
+    """The events of a source; triggers are passed to the pulses before the events of their piece."""
     for events, triggers in stream_until_stopped(source, stopped):
         if pulses is not None:
             pulses.add(triggers, time.time(), span_us(events, triggers)[1])
@@ -141,12 +140,12 @@ def _events_of(
 class Reception(Iterator[Packet]):
     """The packets of a source as they are complete; made by `receive`.
 
-    A context manager for whoever may leave before the end. A source that cannot be read on gives the packets
-    decoded until there, and then raises.
+    A context manager for programs that may stop before the end. A source that cannot be read on gives the
+    packets until there, and then raises.
 
     Attributes:
-        source: What is read.
-        receiver: What decodes it.
+        source: The source.
+        receiver: The receiver.
         link: The configuration; the first of several.
     """
 
@@ -162,7 +161,7 @@ class Reception(Iterator[Packet]):
     def _read(self) -> Iterator[Packet]:
         with self.source:
             try:
-                for events in _events_of(self.source, self._pulses):
+                for events in _read_events(self.source, self._pulses):
                     yield from self.receiver.feed(events)
             except (PluginError, WorkerError):
                 yield from self.receiver.pending_packets
@@ -181,12 +180,12 @@ class Reception(Iterator[Packet]):
         return next(self._packets)
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the frames of the packets that follow."""
+        """Yield the frames of the following packets."""
         for packet in self:
             yield from packet.frames
 
     def to_pandas(self) -> pandas.DataFrame:
-        """The frames of the packets that follow as a table of pandas, with the columns of `frames.csv`.
+        """The frames of the following packets as a pandas table with the columns of `frames.csv`.
 
         Raises:
             ConfigError: pandas is not installed.
@@ -195,7 +194,7 @@ class Reception(Iterator[Packet]):
         return frame
 
     def to_arrow(self) -> pyarrow.Table:
-        """The same as a table of Arrow.
+        """The same as an Arrow table.
 
         Raises:
             ConfigError: pyarrow is not installed.
@@ -204,23 +203,23 @@ class Reception(Iterator[Packet]):
 
     @property
     def counts(self) -> dict[str, int]:
-        """What the receiver has taken, found and dropped so far."""
+        """The receiver's counts so far."""
         return self.receiver.counts
 
     @property
     def losses(self) -> dict[str, Loss]:
-        """What the source had to skip or doubt so far, by kind."""
+        """The source's losses so far, by kind."""
         return self.source.losses
 
     def close(self) -> None:
-        """Close the source, before its end if need be; packets that are not complete are dropped."""
+        """Close the source, also before its end; incomplete packets are dropped."""
         self._packets = iter(())
         self.source.close()
 
     def __repr__(self) -> str:
         counts = self.counts
-        found = ", ".join(f"{counts[name]} {name}" for name in ("events", "packets", "frames"))
-        return f"Reception({self.source.path}: {found} so far)"
+        numbers = ", ".join(f"{counts[name]} {name}" for name in ("events", "packets", "frames"))
+        return f"Reception({self.source.path}: {numbers} so far)"
 
     def __enter__(self) -> Self:
         return self
@@ -241,16 +240,16 @@ def receive_to_folder(
     workers: int = 1,
     sinks: Sequence[str] = (),
     lines: Callable[[str], None] | None = None,
-    advance: Advance = _say_nothing,
+    advance: Advance = _ignore_progress,
     stopped: Stopped = never_stop,
 ) -> dict[str, Any]:
     """Receive a recording into a folder: source, receiver, positions, sinks; in constant memory.
 
-    Arguments are as of `receive`, and more: `folder` is where the result goes, made if need be, where an
-    earlier result is replaced when the new one is complete; None: nothing is written. `plan` is what
-    positions are computed from; `sinks` are output formats beside the default ones, by name, e.g. `parquet`;
-    `lines` takes a line of JSON for each frame, message and fix as it comes; `advance` says how far the
-    reading is; `stopped` ends the run early, and what was decoded until then is written.
+    Arguments are those of `receive`, and more: `folder` gets the result, is created if need be, and keeps an
+    earlier result until the new one is complete; None to write nothing. `plan` is what positions are computed
+    from; `sinks` are output formats beside the default ones, by name, e.g. `parquet`; `lines` takes a line of
+    JSON for each frame, message and fix as it comes; `advance` gets the progress; `stopped` ends the run
+    early, with what was decoded until then.
 
     Returns:
         The summary; its `status` is `failed` when the recording cannot be read on, `degraded` when more
@@ -265,7 +264,7 @@ def receive_to_folder(
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
     with open_until_stopped(source, registry, stopped) as opened:
-        url = _name_of(source, opened)
+        url = _source_name(source, opened)
         pulses = _check_source(opened, url, links, clock_zero)
         with ResultWriter(
             folder,
@@ -281,8 +280,8 @@ def receive_to_folder(
             receiver = Receiver(
                 links, registry.hook, attitude=attitude, clock_zero=clock_zero, workers=workers
             )
-            pieces = ((events, receiver.feed(events)) for events in _events_of(opened, pulses, stopped))
-            return _run(opened, url, receiver, writer, pieces, receiver.close, advance, stopped)
+            pieces = ((events, receiver.feed(events)) for events in _read_events(opened, pulses, stopped))
+            return _run_to_end(opened, url, receiver, writer, pieces, receiver.close, advance, stopped)
 
 
 def live(
@@ -302,12 +301,12 @@ def live(
     warm: bool = True,
     stopped: Stopped = never_stop,
 ) -> dict[str, Any]:
-    """Receive in real time: results to listeners as they come, delays measured, what is too much left out.
+    """Receive in real time: publish results as they come, measure delays, and shed what is too much.
 
-    See `evlcp_sdk.live` for how to listen. A recording is replayed at the pace of its clock. Arguments are as
-    of `receive_to_folder`, and three more: `publisher` is where listeners subscribe and pictures are drawn,
-    and is closed at the end; `budget` says when what is left out; `warm` is to load all kernels before the
-    first event, and before a source that does not wait is opened.
+    See `evlcp_sdk.live` for how to subscribe. A recording is replayed at the pace of its clock. Arguments are
+    those of `receive_to_folder`, and three more: `publisher` takes subscriptions and draws pictures, and is
+    closed at the end; `budget` has the limits of shedding; `warm` loads all kernels before the first event,
+    and before a source that does not wait is opened.
 
     Returns:
         The summary, as of `receive_to_folder`, with `live`: delays by stage, and what was shed.
@@ -325,7 +324,7 @@ def live(
     links = load_links(link, registry=registry)
     publisher = Publisher() if publisher is None else publisher
     try:
-        # A recording waits for its reader, and what is wrong with its name is said at once.
+        # A recording waits for its reader, and a wrong name is reported at once.
         waits = not isinstance(source, EventSource) and is_recording(source)
         if warm and not waits:
             load_kernels(links, positions=plan is not None)
@@ -333,7 +332,7 @@ def live(
         if not opened.live and opened.size_bytes is not None:
             opened = ReplaySource(opened)
         with opened:
-            url = _name_of(source, opened)
+            url = _source_name(source, opened)
             check_sensor(opened, url, links[0].camera)
             if warm and waits:
                 load_kernels(links, positions=plan is not None)
@@ -360,8 +359,8 @@ def live(
                 )
                 pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
                 loop = LiveLoop(opened, receiver, links, publisher, budget, pulses=pulses)
-                ends = loop.close, _say_nothing, stopped, loop.summary
-                table = _run(opened, url, receiver, writer, loop.run(stopped), *ends)
+                ends = loop.close, _ignore_progress, stopped, loop.summary
+                table = _run_to_end(opened, url, receiver, writer, loop.run(stopped), *ends)
         publisher.publish("end", float(table["recording"]["last_us"] or 0), table)
         return table
     finally:
@@ -375,19 +374,19 @@ def convert(
     registry: Registry | None = None,
     size: tuple[int, int] | None = None,
     format: str | None = None,
-    advance: Advance = _say_nothing,
+    advance: Advance = _ignore_progress,
     stopped: Stopped = never_stop,
 ) -> dict[str, Any]:
     """Write events and triggers of a source into a recording, in constant memory.
 
-    `source` and `registry` are as of `receive`, the recording `out` and its `format` as of `open_writer`;
-    `size` is that of the sensor, (columns, rows), where the source does not say it. `advance` says how far
-    the reading is; `stopped` ends the run early: what was read of a camera or a stream until then is written,
-    and nothing of a recording.
+    `source` and `registry` are those of `receive`, the recording `out` and its `format` those of
+    `open_writer`; `size` is the sensor's, (columns, rows), where the source does not have it. `advance` gets
+    the progress; `stopped` ends the run early: of a camera or a stream, all until then is written, of a
+    recording nothing.
 
     Returns:
-        Counts of what was written, losses of the source, `error`: what ended the reading early, or None, and
-        whether a camera was unplugged.
+        Counts of what was written, losses of the source, `error`: the fault that ended the reading, or None,
+        and whether a camera was unplugged.
 
     Raises:
         InputError: The source cannot be opened.
@@ -422,7 +421,7 @@ def convert(
     }
 
 
-def _run(
+def _run_to_end(
     source: EventSource,
     url: str,
     receiver: Receiver,
@@ -433,11 +432,11 @@ def _run(
     stopped: Stopped,
     live: Callable[[], dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
-    """Receive a source to its end, or until it is stopped or fails; return the summary."""
+    """Receive a source until it ends, is stopped or fails; return the summary."""
     status: Status = "complete"
     error = None
     broken: PluginError | WorkerError | None = None
-    given = 0
+    packet_count = 0
     pieces = iter(pieces)
     first_us = last_us = None
     watch = Stopwatch()
@@ -449,9 +448,9 @@ def _run(
                 except StopIteration:
                     break
                 except (PluginError, WorkerError) as fault:
-                    if not given and not receiver.pending_packets:
+                    if not packet_count and not receiver.pending_packets:
                         raise
-                    # What it has let through is kept; the receiver cannot be asked for more.
+                    # Earlier results are kept; the receiver has no more.
                     writer.write(receiver.pending_packets)
                     status, error, broken = "failed", str(fault), fault
                     break
@@ -460,7 +459,7 @@ def _run(
                     last_us = int(events.t_us[-1])
                     writer.events(events)
                 writer.write(packets)
-                given += len(packets)
+                packet_count += len(packets)
                 advance(source.position_bytes, source.size_bytes)
                 if stopped():
                     status = "interrupted"
@@ -471,11 +470,11 @@ def _run(
             if (live is not None or source.size_bytes is None) and stopped():
                 status = "interrupted"
             writer.write(close())
-    if status == "complete" and (reason := _much_dropped(source, receiver)):
+    if status == "complete" and (reason := _describe_losses(source, receiver)):
         status, error = "degraded", f"{url}: {reason}"
     end = RunEnd(
         status,
-        **_tables_of(source, url, watch, first_us, last_us),
+        **_build_tables(source, url, watch, first_us, last_us),
         counts=receiver.counts,
         losses=source.losses,
         error=error,
@@ -489,30 +488,29 @@ def _run(
     return summary
 
 
-def _tables_of(
+def _build_tables(
     source: EventSource, url: str, watch: Stopwatch, first_us: int | None, last_us: int | None
 ) -> dict[str, dict[str, Any]]:
-    """What the summary says of a recording, and of how it was worked off."""
+    """The summary's tables of a recording, and of its processing."""
     recording = summarize_source(source, url, first_us, last_us)
     recording |= {"guessed": source.guessed, "step_us": source.step_us}
     duration_s = recording["duration_s"]
-    pace = round(times_real_time(duration_s, watch.processor_s), 3) if duration_s else None
     processing = {
         "processor_s": round(watch.processor_s, 6),
         "elapsed_s": round(watch.elapsed_s, 6),
         "kernels_s": round(watch.kernels_s, 6),
         "events_per_s": round(source.counts["events"] / watch.processor_s),
-        "times_real_time": pace,
+        "times_real_time": round(times_real_time(duration_s, watch.processor_s), 3) if duration_s else None,
     }
     return {"recording": recording, "processing": processing}
 
 
-def _much_dropped(source: EventSource, receiver: Receiver) -> str | None:
-    """How much of a recording was dropped, where that is too much to call the result whole."""
+def _describe_losses(source: EventSource, receiver: Receiver) -> str | None:
+    """What was dropped of a recording, where that is too much for a complete result; else None."""
     lost = sum(loss.count for loss in source.losses.values())
     dropped = lost + sum(n for name, n in receiver.counts.items() if name.startswith("dropped_"))
     share = dropped / max(source.counts["events"] + lost, 1)
-    if dropped < DEGRADED_LEAST or share <= DEGRADED_SHARE:
+    if dropped < _MIN_DEGRADED or share <= _DEGRADED_SHARE:
         return None
     return f"{dropped} events or words, {share:.1%}, were dropped: losses and counts in summary.json say why"
 
@@ -528,27 +526,27 @@ def film(
     slow: float = 400.0,
     longest_px: int = 640,
     whole: bool = False,
-    advance: Advance = _say_nothing,
+    advance: Advance = _ignore_progress,
 ) -> dict[str, Any]:
     """Film a recording in slow motion, with regions, symbols and distances drawn in; in bounded memory.
 
-    The recording is read twice: to decode it until the end of what is shown, and for the events.
+    The recording is read twice: to decode it until the end of the film, and for the events.
 
     The film, `out`, is an animated picture, `.webp` or `.gif`, or `.mp4`. It starts `from_ms` after the first
-    event, or with the first frame that is decoded, or at the start where there is none; shows `for_ms` of the
-    recording, `slow` times slower than it was, in pictures of `longest_px`, and the bars only, or the `whole`
-    image. `advance` says how far the reading is; other arguments are as of `receive`.
+    event, or with the first decoded frame, or at the start where there is none; it shows `for_ms` of the
+    recording, slowed down by `slow`, in pictures of `longest_px`, and the bars only, or the `whole` image.
+    `advance` gets the progress; other arguments are those of `receive`.
 
     Returns:
-        What it shows: pictures, their size, time, transmitters, frames.
+        A table of the film: pictures, their size, time, transmitters, frames.
 
     Raises:
-        InputError: The recording cannot be read, or has nothing there.
-        ConfigError: The film would have too many pictures, or is to be of another kind, or one whose
-            extra is not installed.
+        InputError: The recording cannot be read, or has no events there.
+        ConfigError: The film would have too many pictures, or its format is unknown or needs an extra that
+            is not installed.
         OutputError: It cannot be written.
     """
-    # Matplotlib and Pillow take longer to import than other use cases to start.
+    # Imported here: Matplotlib and Pillow are slow to import.
     from evlcp_sdk.report.film import check_film, draw_film, gather_footage, plan_film, save_film
 
     kind = check_film(out, for_ms, slow)
@@ -596,9 +594,9 @@ def calibrate(
 ) -> CalibrationResult:
     """Estimate focal length, principal point and distortion from bars at known places.
 
-    `recordings` show bars that stand at `sites`; `poses` say where the camera was, and when, and `name` is
-    what messages call the file they come from, which has a heading and a line a pose. `limit_px` is the
-    uncertainty of the image's corners that is allowed; `link` and `registry` are as of `receive`.
+    `recordings` show bars at `sites`; `poses` are places and times of the camera, and `name` is the name in
+    messages of their file, which has a heading and a line a pose. `limit_px` is the largest uncertainty of
+    the image's corners; `link` and `registry` are those of `receive`.
 
     Raises:
         InputError: A recording cannot be read.
@@ -612,37 +610,37 @@ def calibrate(
 
     registry = Registry.load() if registry is None else registry
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
-    _check_lines({"": link})
-    _check_names(recordings, poses, name)
+    _check_layouts({"": link})
+    _check_recordings(recordings, poses, name)
     axes = LocalAxes.of(sites)
     views: list[CalibrationView] = []
     for url in recordings:
-        who = BarRegistry(sites, link.position)
-        seen, _ = _seen_at(url, poses, {"": link}, registry, who, name)
-        for how in who.contradictions.values():
-            raise ConfigError(f"{url}: {how}")
-        for pose, points in seen:
-            bars = []
-            for number, found in points.items():
-                if (site := who.known_sites.get(number)) is not None:
-                    enu = site.layout_positions_m(link.bar, axes)
-                    bars.append(
-                        replace(found, transmitter=site.transmitter_id, enu_m=enu, survey=site.survey_sigmas)
+        bars = BarRegistry(sites, link.position)
+        observed, _ = _observe_bars(url, poses, {"": link}, registry, bars, name)
+        for contradiction in bars.contradictions.values():
+            raise ConfigError(f"{url}: {contradiction}")
+        for pose, views_of in observed:
+            known = []
+            for number, view in views_of.items():
+                if (site := bars.known_sites.get(number)) is not None:
+                    enu_m = site.layout_positions_m(link.bar, axes)
+                    known.append(
+                        replace(view, transmitter=site.transmitter_id, enu_m=enu_m, survey=site.survey_sigmas)
                     )
-            views.append(_view(pose, bars, axes))
+            views.append(_make_view(pose, known, axes))
     return fit_camera(views, link.camera, ErrorModel.of(link.position), limit_px=limit_px)
 
 
-def _check_lines(links: Mapping[str, Link]) -> None:
+def _check_layouts(links: Mapping[str, Link]) -> None:
     for name, link in links.items():
         if not link.bar.is_even_line or link.bar.clusters < 2:
-            which = f"link '{name}': " if name else ""
+            prefix = f"link '{name}': " if name else ""
             raise ConfigError(
-                f"{which}a survey is of bars whose clusters stand evenly in line; write a site.toml by hand"
+                f"{prefix}a survey is of bars whose clusters stand evenly in line; write a site.toml by hand"
             )
 
 
-def _check_names(recordings: Sequence[str], poses: Sequence[KnownPose], source: str) -> None:
+def _check_recordings(recordings: Sequence[str], poses: Sequence[KnownPose], source: str) -> None:
     names = [Path(url).name for url in recordings]
     known = names if len(names) > 1 else ["", *names]
     for line, pose in enumerate(poses, 2):
@@ -651,7 +649,7 @@ def _check_names(recordings: Sequence[str], poses: Sequence[KnownPose], source: 
             raise ConfigError(f"{source}: line {line}: recording = {pose.recording!r}: {expected}")
 
 
-def _view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> CalibrationView:
+def _make_view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> CalibrationView:
     from evlcp_sdk.place.calibration import CalibrationView
     from evlcp_sdk.scene.sites import LocalAxes
 
@@ -659,19 +657,19 @@ def _view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> Calibrat
     rotation = None
     if pose.attitude is not None:
         rotation = axes.rotation_from(LocalAxes(*place)) @ pose.attitude.rotation()
-    where = axes.to_enu(*place)
-    return CalibrationView(tuple(bars), where, pose.position_sigma_m, rotation, pose.attitude_sigma_deg)
+    enu_m = axes.to_enu(*place)
+    return CalibrationView(tuple(bars), enu_m, pose.position_sigma_m, rotation, pose.attitude_sigma_deg)
 
 
-def _seen_at(
+def _observe_bars(
     url: str,
     poses: Sequence[KnownPose],
     links: Mapping[str, Link],
     registry: Registry,
-    who: BarRegistry,
+    bars: BarRegistry,
     source: str,
 ) -> tuple[list[tuple[KnownPose, dict[int, BarView]]], dict[int, str]]:
-    """The poses of a recording with the view of each transmitter then; the link of each transmitter.
+    """The poses of a recording, each with the views of the transmitters; and the link of each transmitter.
 
     Raises:
         InputError: The recording cannot be read.
@@ -690,38 +688,38 @@ def _seen_at(
         for packet in packets:
             if packet.link not in placing:
                 continue
-            who.add_packet(packet)
+            bars.add_packet(packet)
             if packet.echo_of is not None:
                 frames.pop(packet.transmitter, None)
                 continue
             link_of[packet.transmitter] = packet.link
             kept = frames.setdefault(packet.transmitter, [])
             clusters, period_us = placing[packet.link].bar.clusters, periods[packet.link]
-            for one in packet.frames:
-                first_us, last_us = min(first_us, one.t_us), max(last_us, one.t_us)
-                if len(one.points_px) == clusters and any(
-                    abs(one.points_t_us - pose.t_us) <= period_us for pose in poses
+            for frame in packet.frames:
+                first_us, last_us = min(first_us, frame.t_us), max(last_us, frame.t_us)
+                if len(frame.points_px) == clusters and any(
+                    abs(frame.points_t_us - pose.t_us) <= period_us for pose in poses
                 ):
-                    kept.append(one)
-    found: list[tuple[KnownPose, dict[int, BarView]]] = []
+                    kept.append(frame)
+    observed: list[tuple[KnownPose, dict[int, BarView]]] = []
     for pose in poses:
-        found.append((pose, {}))
-        for number, seen in frames.items():
+        observed.append((pose, {}))
+        for number, kept in frames.items():
             name = link_of[number]
             link = placing[name]
             errors = ErrorModel.of(link.position)
             layout_m = link.bar.cluster_positions_m()
-            points = interpolate_points(number, seen, pose.t_us, periods[name], layout_m, errors)
-            if points is not None:
-                found[-1][1][number] = points
+            view = interpolate_points(number, kept, pose.t_us, periods[name], layout_m, errors)
+            if view is not None:
+                observed[-1][1][number] = view
     times = [pose.t_us for pose in poses]
-    shown = any(points for _, points in found) or any(first_us <= t <= last_us for t in times)
-    if times and first_us <= last_us and not shown:
+    in_view = any(views for _, views in observed) or any(first_us <= t <= last_us for t in times)
+    if times and first_us <= last_us and not in_view:
         raise ConfigError(
             f"{source}: t_us from {min(times):.16g} to {max(times):.16g}: expected the camera's clock, us,"
             f" which is at {first_us:.0f} to {last_us:.0f} where {url} shows bars"
         )
-    return found, link_of
+    return observed, link_of
 
 
 def survey(
@@ -733,10 +731,10 @@ def survey(
     name: str = "poses",
     known: Sequence[BarSite] = (),
 ) -> list[SurveyedBar]:
-    """Estimate where bars stand that send their ids, from known poses; the camera is known as the link says.
+    """Estimate where bars stand that send their ids, from known poses; the link describes the camera.
 
-    Arguments are as of `calibrate`, with poses that say how the camera was turned, too; `known` are bars that
-    need no survey. Bars of several links are told apart by their codes, and their sites name them.
+    Arguments are those of `calibrate`, with poses that have an attitude, too; `known` are bars that need no
+    survey. Bars of several links are distinguished by their codes, and their sites name them.
 
     Raises:
         InputError: A recording cannot be read.
@@ -750,42 +748,42 @@ def survey(
     registry = Registry.load() if registry is None else registry
     links = name_links(load_links(link, registry=registry))
     placing = select_positioning_links(links)
-    _check_lines(placing)
-    _check_names(recordings, poses, name)
-    listed = {site.transmitter_id for site in known}
-    first, like = poses[0], next(iter(placing.values()))
+    _check_layouts(placing)
+    _check_recordings(recordings, poses, name)
+    known_ids = {site.transmitter_id for site in known}
+    first, first_link = poses[0], next(iter(placing.values()))
     axes = LocalAxes(first.latitude_deg, first.longitude_deg, first.height_m)
     views: list[CalibrationView] = []
-    sends: dict[int, str] = {}
+    link_of_id: dict[int, str] = {}
     registries: list[BarRegistry] = []
     for url in recordings:
-        who = BarRegistry((), like.position)
-        seen, link_of = _seen_at(url, poses, links, registry, who, name)
-        registries.append(who)
-        ids = who.ids
-        for pose, points in seen:
-            bars = []
-            for n, found in points.items():
-                if n not in ids or ids[n] in listed:
+        registries.append(BarRegistry((), first_link.position))
+        observed, link_of = _observe_bars(url, poses, links, registry, registries[-1], name)
+        ids = registries[-1].ids
+        for pose, views_of in observed:
+            new = []
+            for number, view in views_of.items():
+                if number not in ids or ids[number] in known_ids:
                     continue
-                number, by = ids[n], link_of[n]
-                if sends.setdefault(number, by) != by:
+                id, by = ids[number], link_of[number]
+                if link_of_id.setdefault(id, by) != by:
                     raise ConfigError(
-                        f"{url}: id {number} is sent by '{sends[number]}' and '{by}': give one link at a time"
+                        f"{url}: id {id} is sent by '{link_of_id[id]}' and '{by}': give one link at a time"
                     )
-                bars.append(replace(found, transmitter=number))
-            views.append(_view(pose, bars, axes))
-    long_m = {number: placing[by].bar.length_m for number, by in sends.items()}
-    surveyed = survey_bars(views, axes, long_m, like.camera, like.camera_sigma, ErrorModel.of(like.position))
-    named = [
-        replace(bar, site=replace(bar.site, link=sends[bar.site.transmitter_id] or None)) for bar in surveyed
+                new.append(replace(view, transmitter=id))
+            views.append(_make_view(pose, new, axes))
+    lengths_m = {id: placing[by].bar.length_m for id, by in link_of_id.items()}
+    camera, errors = first_link.camera, ErrorModel.of(first_link.position)
+    surveyed = survey_bars(views, axes, lengths_m, camera, first_link.camera_sigma, errors)
+    sites = [replace(bar.site, link=link_of_id[bar.site.transmitter_id] or None) for bar in surveyed]
+    contradictions = {id: text for bars in registries for id, text in bars.find_contradictions(sites).items()}
+    return [
+        replace(bar, site=site, contradicted=contradictions.get(site.transmitter_id, ""))
+        for bar, site in zip(surveyed, sites, strict=True)
     ]
-    sites = [bar.site for bar in named]
-    said = {id_: how for who in registries for id_, how in who.find_contradictions(sites).items()}
-    return [replace(bar, contradicted=said.get(bar.site.transmitter_id, "")) for bar in named]
 
 
-def survey_on_the_way(
+def survey_along_track(
     recordings: Sequence[str],
     plan: PositionPlan,
     link: Link | Path | str | Sequence[Link | Path | str] | None = None,
@@ -796,8 +794,8 @@ def survey_on_the_way(
     """Estimate where new bars stand from the camera's own track past known ones.
 
     In the recordings known bars, or fixes of satellites, both in the plan, give positions, and new bars send
-    their ids; other arguments are as of `receive`. A recording is read two times, and a third time where a
-    new bar was alone in view before it sent its id.
+    their ids; other arguments are those of `receive`. A recording is read twice, and a third time where a new
+    bar was alone in view before it sent its id.
 
     Raises:
         InputError: A recording cannot be read.
@@ -808,51 +806,49 @@ def survey_on_the_way(
     plan.check_links(list(name_links(links)))
     poses: list[KnownPose] = []
     known = {site.transmitter_id: site for site in plan.sites}
-    seen = []
+    summaries = []
     for url in recordings:
-        found, placed, reason = _own_poses(url, plan, links, attitude, registry)
-        poses += found
-        known = {site.transmitter_id: site for site in placed} | known
-        seen.append(f"{url}: {reason}")
+        own_poses, sites, summary = _track_poses(url, plan, links, attitude, registry)
+        poses += own_poses
+        known = {site.transmitter_id: site for site in sites} | known
+        summaries.append(f"{url}: {summary}")
     if not poses:
         raise ConfigError(
-            f"no new bar was in view where the track is known: nothing to survey ({'; '.join(seen)})"
+            f"no new bar was in view where the track is known: nothing to survey ({'; '.join(summaries)})"
         )
     return survey(recordings, poses, links, registry=registry, name="track", known=[*known.values()])
 
 
-def _own_poses(
+def _track_poses(
     url: str,
     plan: PositionPlan,
     links: Sequence[Link],
     attitude: Attitude | AttitudeLog | None,
     registry: Registry,
 ) -> tuple[list[KnownPose], list[BarSite], str]:
-    """The poses of a recording's own track while new bars are in view, the bars that it goes by, and what it
-    saw.
-    """
+    """The poses of a recording's own track while new bars are in view, the known bars, and a summary."""
     from evlcp_sdk.place.navigator import Navigator
     from evlcp_sdk.place.survey import TrackPoses
     from evlcp_sdk.scene.attitude import attitude_source
 
     navigator = Navigator(select_positioning_links(name_links(links)), plan, attitude)
     track = TrackPoses(navigator, attitude_source(attitude), Path(url).name)
-    taken: dict[int, BarSite] = {}
+    sites_of: dict[int, BarSite] = {}
     with receive(url, links, registry=registry, attitude=attitude) as packets:
         for packet in packets:
             track.add_packet(packet)
-            taken = navigator.positioner.bars.known_sites | taken
+            sites_of = navigator.positioner.bars.known_sites | sites_of
     poses, ids = track.close(), navigator.positioner.bars.ids
-    wrong = [n for n, site in taken.items() if ids.get(n, site.transmitter_id) != site.transmitter_id]
+    wrong = [n for n, site in sites_of.items() if ids.get(n, site.transmitter_id) != site.transmitter_id]
     if not wrong:
-        return poses, list(taken.values()), track.summary
-    # A new bar was taken for a known one as long as it had not sent its id: its number is no site's.
-    numbers = {said: number for number, said in ids.items()}
-    none = max(ids) + 1
+        return poses, list(sites_of.values()), track.summary
+    # Until it sent its id, a new bar was taken for a known one: its number belongs to no site.
+    numbers = {id: number for number, id in ids.items()}
+    unused = max(ids) + 1
     sites = tuple(
-        replace(site, transmitter=numbers.get(site.transmitter_id, none + i))
+        replace(site, transmitter=numbers.get(site.transmitter_id, unused + i))
         for i, site in enumerate(plan.sites)
     )
     if sites == plan.sites:
         raise ConfigError(f"{url}: transmitter {wrong[0]} sends one id and then another")
-    return _own_poses(url, replace(plan, sites=sites), links, attitude, registry)
+    return _track_poses(url, replace(plan, sites=sites), links, attitude, registry)

@@ -68,7 +68,7 @@ def survey(
         plan = place.plan(links)
         assert plan is not None
         known = None if place.attitude_file is None else AttitudeLog.read(place.attitude_file)
-        found = run.survey_on_the_way(recordings, plan, links, attitude=known, registry=registry)
+        found = run.survey_along_track(recordings, plan, links, attitude=known, registry=registry)
     _write(found, out, as_json=as_json)
 
 
