@@ -294,7 +294,7 @@ def infer_time_unit(
     Lights blink at 100 to 60 000 chips a second, a range of less than a thousandfold, so that only one of
     units a thousandfold apart fits. If none does, times since 1970 show their unit; and a camera counts whole
     microseconds: its nanoseconds are multiples of 1000, its milliseconds have three decimals, its seconds
-        six.
+    six.
     A unit by which fewer than 20 or more than 50 million events come a second (500 million of a whole sensor)
     is another one. Times were rounded if a list of one light would be over in an instant, or its events come
     by the million, and would not in a unit a thousand times as long.

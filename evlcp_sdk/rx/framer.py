@@ -99,7 +99,7 @@ class StreamContext:
         announcer: Announces finished stages.
         limits: How much each link holds at most.
         numbers: Where the numbers of transmitters come from.
-        bar_decoders: The `BarDecoder`s of a link, by its name; None for those of this process.
+        bar_decoders: Decoders of a link's bars (`BarDecoder`), by its name; None for those of this process.
     """
 
     clock: CameraClock
