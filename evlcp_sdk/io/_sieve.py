@@ -36,11 +36,9 @@ class Sieve:
         self._row_offset = 0
 
     def sift(self, events: Events, first: int) -> Events:
-        """Return the events to keep, and earlier ones whose times are now confirmed.
+        """Return those of the next events to keep, and earlier ones whose times are now confirmed.
 
-        Args:
-            events: The next events; their columns stay the caller's.
-            first: Line or row of the first of them.
+        `first` is the line or row of the first of them; the columns stay the caller's.
         """
         # A heading and empty lines are no events.
         self._row_offset = first - self._clock.counts["events"]

@@ -120,10 +120,10 @@ class ColumnSource(EventSource):
                 raise InputError(
                     f"{path}: {what or f'damaged or closed file: {format_error(error)}'}"
                 ) from error
-            self._begin(table, size_bytes, unit, inverted)
+            self._read_first_piece(table, size_bytes, unit, inverted)
             self._stack = stack.pop_all()
 
-    def _begin(self, table: EventTable, size_bytes: int, unit: str | None, inverted: bool) -> None:
+    def _read_first_piece(self, table: EventTable, size_bytes: int, unit: str | None, inverted: bool) -> None:
         """Read the first piece and find the unit of its times."""
         self._pieces, self._position, self._end = table.pieces, 0, size_bytes
         self._counts = {"rows_out_of_order": 0, "rows_cut": 0, "times_gone_round": 0}
@@ -279,12 +279,8 @@ def _merge_triggers(
 
 
 def _unwrap_times(times: NDArray[Any], before: int | None, gone_round: int) -> tuple[NDArray[Any], int, int]:
-    """Unwrap the times of a counter of 32 or 24 bits; other times stay as they are.
-
-    Args:
-        times: The next times.
-        before: The time before them; None without one.
-        gone_round: By how much the counter has wrapped before.
+    """Unwrap the times of a counter of 32 or 24 bits, after a time and wraps by `gone_round`; others stay as
+    they are.
 
     Returns:
         The times, how often they wrapped, and by how much the counter has wrapped in all.

@@ -179,14 +179,10 @@ def _quote_line(line: str) -> str:
 
 
 class _TextTable:
-    """The layout of a text: what separates cells, and which column is what.
-
-    Args:
-        lines: The first lines.
-        fields: Which column is what; None recognizes it by the heading or by values.
+    """The layout of a text by its first lines: what separates cells, and which column is what.
 
     Attributes:
-        fields: Which column is what; None if it was not recognized.
+        fields: Which column is what: as given, or else by the heading or by values; None if not recognized.
         first: Number of the first line that may be a row, or of the one that was not recognized.
         heading: The line that has the names, or is the first row.
     """

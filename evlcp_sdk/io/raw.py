@@ -50,10 +50,7 @@ class ByteReader(Protocol):
 
 
 class ChunkReader(ABC):
-    """A `ByteReader` of bytes that come in chunks.
-
-    Args:
-        ready: Bytes before the first chunk.
+    """A `ByteReader` of bytes that come in chunks, after those that are `ready`.
 
     Attributes:
         bytes_read: Bytes that have been read.
@@ -297,7 +294,6 @@ class RawSource(EventSource):
             self._end += size or 0
 
     def _get_words(self) -> np.ndarray[tuple[int], np.dtype[np.unsignedinteger]]:
-        """Return the complete words in the buffer."""
         size = self._codec.word.itemsize
         count = (self._end - self._start) // size
         return self._buffer[self._start : self._start + count * size].view(self._codec.word)

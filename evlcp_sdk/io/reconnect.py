@@ -18,11 +18,6 @@ class ReconnectingSource(WrappingSource):
 
     Its clock may start anew each time; to a receiver that is a restart of the camera's clock.
 
-    Args:
-        opener: Opens the source.
-        stopped: Returns whether to give up.
-        sleep: Waits so many seconds.
-
     Raises:
         InputError: It cannot be opened the first time.
     """

@@ -20,12 +20,7 @@ the noise of its pixels keeps a sensor from being silent for so long."""
 
 
 class WrappingSource(EventSource):
-    """A source that passes on what another one gives, and closes it.
-
-    Args:
-        source: The other source.
-        size_bytes: Size of its file; None if it will be reopened.
-    """
+    """A source that passes on what another one gives, and closes it."""
 
     def __init__(self, source: EventSource, size_bytes: int | None = None) -> None:
         super().__init__(source.path, source.format, source.width, source.height, source.header, size_bytes)
@@ -54,12 +49,7 @@ class WrappingSource(EventSource):
 
 
 class LoopSource(WrappingSource):
-    """A recording in a loop, its clock going on.
-
-    Args:
-        opener: Opens the recording.
-        for_us: Ends with the pass that reaches this time, us.
-    """
+    """A recording in a loop, its clock going on; the loop ends with the pass that reaches `for_us`."""
 
     def __init__(self, opener: Callable[[], EventSource], for_us: float = math.inf) -> None:
         super().__init__(opener())

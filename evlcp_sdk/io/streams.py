@@ -29,12 +29,7 @@ def _parse_encoding(text: str) -> str:
 
 
 class SocketReader(ChunkReader):
-    """The bytes that a socket receives, behind a header if they come without one.
-
-    Args:
-        sock: The socket: a connected stream, or a bound datagram socket.
-        header: The header to prepend.
-    """
+    """The bytes that a socket receives, behind `header` if they come without one."""
 
     def __init__(self, sock: socket.socket, header: bytes = b"") -> None:
         super().__init__()

@@ -14,11 +14,7 @@ from evlcp_sdk.suggestions import suggest
 
 
 def split_options(url: str, parsers: Mapping[str, Callable[[str], Any]]) -> tuple[str, dict[str, Any]]:
-    """Split a name at its last `?`; return the part before it, and the options.
-
-    Args:
-        url: The name.
-        parsers: The parser of each option's value.
+    """Split a name at its last `?`; return the part before it, and the options as their parsers return them.
 
     Raises:
         InputError: An option is unknown, given twice, or has another value than expected.

@@ -51,7 +51,7 @@ PIXEL_STEP, DRAW_STEP = 0x9E3779B97F4A7C15, 0xD1B54A32D192ED03
 
 
 @njit(inline="always")
-def mix(z: Any) -> Any:
+def mix_bits(z: Any) -> Any:
     """Mix a 64-bit word by the finalizer of splitmix64, a bijection."""
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -71,8 +71,8 @@ def _interpolate(table: Array, share: float) -> float:
 @njit
 def hash_normal(seed: Any, pixel: int, draw: Any, purpose: int, quantiles: Array) -> float:
     """Return the normal number of a (seed, pixel, draw, purpose), cut off at `NOISE_LIMIT`."""
-    key = mix(seed + np.uint64(pixel) * np.uint64(PIXEL_STEP))
-    z = mix(key + np.uint64(draw) * np.uint64(DRAW_STEP) + np.uint64(purpose))
+    key = mix_bits(seed + np.uint64(pixel) * np.uint64(PIXEL_STEP))
+    z = mix_bits(key + np.uint64(draw) * np.uint64(DRAW_STEP) + np.uint64(purpose))
     return float(_interpolate(quantiles, float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)))
 
 
@@ -209,7 +209,7 @@ def _run_filtered(i: int, t_us: float, until: float, batch: Batch, model: PixelM
     while True:
         if batch.draw[i] != drawn:
             drawn = batch.draw[i]
-            word = mix(batch.key[i] + np.uint64(drawn) * np.uint64(DRAW_STEP))
+            word = mix_bits(batch.key[i] + np.uint64(drawn) * np.uint64(DRAW_STEP))
             noise = math.log(
                 _interpolate(model.shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10)
             )
@@ -303,7 +303,7 @@ def _draw_noise(m: int, batch: Batch, shifts: Array) -> int:
     even = (m + _VECTOR - 1) // _VECTOR * _VECTOR
     for a in range(even):
         k = np.uint64(candidates[min(a, m - 1)])
-        word = mix(key[k] + np.uint64(draw[k]) * np.uint64(DRAW_STEP))
+        word = mix_bits(key[k] + np.uint64(draw[k]) * np.uint64(DRAW_STEP))
         bits[_M_SPARE + a] = np.int64(word)
     # Put half a word into the lowest bits of 2^52.
     for a in range(even):
@@ -529,7 +529,7 @@ class Halos(NamedTuple):
     table_per_px: Array
 
 
-class Near(NamedTuple):
+class Cores(NamedTuple):
     """The image of a point without its halos.
 
     Attributes:
@@ -545,7 +545,7 @@ class Near(NamedTuple):
     reach: Array
 
 
-class Scenery(NamedTuple):
+class Background(NamedTuple):
     """The background.
 
     Attributes:
@@ -585,7 +585,14 @@ class _SourceLight(NamedTuple):
 
 @njit(fastmath={"contract"})
 def _weigh_clusters(
-    a: int, g: int, pose: int, size: tuple[int, int], f: Array, strips: Strips, near: Near, room: _SourceLight
+    a: int,
+    g: int,
+    pose: int,
+    size: tuple[int, int],
+    f: Array,
+    strips: Strips,
+    near: Cores,
+    room: _SourceLight,
 ) -> None:
     """Find the clusters of a source that light some of `size` (lanes, pixels), and the weight of row `a`."""
     lanes, count = size
@@ -659,7 +666,7 @@ def _update_light(
     size: tuple[int, int],
     f: Array,
     scene: tuple[Strips, Halos],
-    near: Near,
+    near: Cores,
     room: _SourceLight,
 ) -> None:
     """Update the light of source g with its row of levels on each pixel: part of row `a`.
@@ -727,7 +734,7 @@ def _run_batch(
     size: tuple[int, int],
     of_batch: tuple[Any, int],
     end_us: float,
-    world: tuple[TimeLine, Strips, Halos, Near, Scenery],
+    world: tuple[TimeLine, Strips, Halos, Cores, Background],
     room: tuple[_SourceLight, Array, Array],
     batch: Batch,
     model: PixelModel,
@@ -829,7 +836,7 @@ def run_pixels(
     last: int,
     block: ActivePixels,
     store: tuple[Array, Array, int],
-    world: tuple[TimeLine, Strips, Halos, Near, Scenery],
+    world: tuple[TimeLine, Strips, Halos, Cores, Background],
     model: PixelModel,
     most_events: int,
     out: Requests,
@@ -863,7 +870,10 @@ def run_pixels(
         for i, pixel in enumerate(pixels):
             s, c = states[pixel], counters[pixel]
             batch.code[i] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1
-            batch.key[i], batch.draw[i] = mix(model.seed + np.uint64(pixel) * np.uint64(PIXEL_STEP)), c[DRAW]
+            batch.key[i], batch.draw[i] = (
+                mix_bits(model.seed + np.uint64(pixel) * np.uint64(PIXEL_STEP)),
+                c[DRAW],
+            )
             f[_X + i], f[_Y + i] = block.at_px[0, begin + i], block.at_px[1, begin + i]
             f[_ON + i], f[_OFF + i], f[_LAST_OUT + i] = s[ON_FACTOR], s[OFF_FACTOR], s[T_LAST_OUT]
             f[_U + i], f[_REFERENCE + i], f[_READY + i] = s[U_BASE], s[REFERENCE], s[T_READY]

@@ -64,17 +64,12 @@ def draw_led_light(bar: BarSpec, leds: int, seed: int) -> NDArray[np.float64]:
 
 
 def split_into_strips(bar: BarSpec, layout: BarLayout, seed: int = 0) -> list[LitStrip]:
-    """Split the LEDs of a layout into strips.
+    """Split the LEDs of a layout into strips, with brightnesses drawn by `seed`.
 
     On a grid each column of clusters is one strip of even light, as wide as its columns of LEDs. In other
     layouts aligned LEDs make a strip: columns and rows, the longest first. Neighbours closer than two widths
     of an LED light the gap between them; others light a square each. Neighbours of one cluster are one part,
     unless LEDs differ or are hidden one by one.
-
-    Args:
-        bar: The bar.
-        layout: Its LEDs.
-        seed: Seed of their brightness.
 
     Raises:
         ConfigError: There are more strips than a scene may have, or a dead or stuck LED is none of the bar's.

@@ -204,17 +204,11 @@ class BarLight:
     def hide_clusters(
         self, when_us: Floats, levels: Floats, begin_us: float, end_us: float, lit: LitStrip
     ) -> tuple[Floats, Floats]:
-        """Darken what covers hide.
+        """Darken what covers hide in the parts of a strip.
 
-        Args:
-            when_us: Times of switching after `begin_us` and before `end_us`, float64 (n,).
-            levels: Levels from `begin_us` and from each on, float64 (n + 1, parts).
-            begin_us: Start of the first levels.
-            end_us: End of the last levels.
-            lit: The strip of these parts.
-
-        Returns:
-            The times, with those at which a cover starts or ends, and the levels.
+        `when_us` are times of switching between `begin_us` and `end_us`, float64 (n,), `levels` hold from
+        `begin_us` and from each of them on, float64 (n + 1, parts). Returns both, with the times at which a
+        cover starts or ends.
         """
         slats, speed_mps = self.bar.lattice_m, self.bar.lattice_mps
         if not self._covers and not self.bar.covered and slats is None:
@@ -429,10 +423,6 @@ def _draw_lamps(scene: Scene) -> list[LampSpec]:
 
 def sources_of(scene: Scene, registry: Registry | None = None) -> tuple[list[BarLight], list[Source]]:
     """Return the light of the bars and the lamps of a scene.
-
-    Args:
-        scene: The scene.
-        registry: The algorithms of its links; None for all that are installed.
 
     Raises:
         ConfigError: A bar cannot send its payload, or the strips are too many.

@@ -67,15 +67,10 @@ class Vibration:
 
 
 class CameraPath:
-    """Position and attitude of the camera at any time.
-
-    Args:
-        motion: The approach, or the file of a path.
-        duration_s: How long the path must last.
-        seed: Seed of the vibration.
+    """Position and attitude of the camera at any time of a scene, with a vibration of this seed.
 
     Raises:
-        InputError: The file cannot be read.
+        InputError: The file of a path cannot be read.
         ConfigError: It is not a path, or too short.
     """
 

@@ -22,14 +22,8 @@ def blur_of(depth_m: float, lens: LensSpec, camera: CameraModel, more_px: float 
     """Return the image of a point: diffraction with or without its wings, defocus, and the blur left in
     focus.
 
-    With wings, an ideal f/2 lens at 630 nm without other blur spreads 5.1 % of the light beyond 1 px of
-    4.86 um, and 2.6 % beyond 2 px.
-
-    Args:
-        depth_m: Depth of the point.
-        lens: The lens.
-        camera: The camera.
-        more_px: Sigma of additional blur, px.
+    With wings, an ideal f/2 lens at 630 nm without other blur spreads 5.1 % of the light beyond 1 px of 4.86
+    um, and 2.6 % beyond 2 px. `more_px` is the sigma of additional blur.
     """
     other = math.hypot(_defocus_px(depth_m, lens, camera), lens.blur_px, more_px)
     if not lens.wings:

@@ -32,12 +32,7 @@ def truth_of(
     In its table, `scene` has the scene's parameters; `psf_sigma_px` and `e_led` the blur and the light of
     each bar; `others` the reflections: of which bar (`src`), how bright relative to it (`gain`) and where in
     the image; `simulator` the resolved scene, which renders the recording again. Bars, reflections and camera
-    are sampled every millisecond.
-
-    Args:
-        simulated: The simulation, or the scene.
-        seed: A seed instead of the scene's.
-        registry: The algorithms of its links; None for all that are installed.
+    are sampled every millisecond. A `seed` replaces the scene's.
 
     Raises:
         ConfigError: The scene cannot be rendered.
@@ -117,7 +112,6 @@ def _describe_scene(simulation: Simulation) -> dict[str, Any]:
 
 
 def _describe_road(scene: Scene) -> dict[str, Any]:
-    """Return the parameters of bloom, wiper and potholes, if there are any."""
     found: dict[str, Any] = {}
     lens, motion, wiper = scene.lens, scene.motion, scene.wiper
     if lens.bloom > 0:
@@ -132,7 +126,6 @@ def _describe_road(scene: Scene) -> dict[str, Any]:
 
 
 def _locate_reflections(simulation: Simulation, position: Floats, attitude: Floats) -> list[dict[str, Any]]:
-    """Return the reflections of all bars, each with its centre over time, px."""
     found = []
     for i, light in enumerate(simulation.bars):
         columns = len(light.strips)

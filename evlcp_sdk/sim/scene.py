@@ -564,12 +564,7 @@ def resolve_scene(
 
 
 def links_of(scene: Scene, registry: Registry | None = None, *, source: str = "") -> tuple[Link, ...]:
-    """Return the resolved link of each bar.
-
-    Args:
-        scene: The scene.
-        registry: The algorithms of its links; None for all that are installed.
-        source: Name of the scene in error messages.
+    """Return the resolved link of each bar of a scene, called `source` in error messages.
 
     Raises:
         ConfigError: A bar's link is not valid; one line per fault.
@@ -684,7 +679,6 @@ _LINK_KEYS = {
 
 
 def _hint_at_link(path: tuple[str, ...]) -> str | None:
-    """Return where an unknown key of a bar is in its link."""
     instead = _LINK_KEYS.get(path[-1]) if path[0] == "bars" else None
     return f"; its link says it: bars.link.{instead}" if instead else None
 

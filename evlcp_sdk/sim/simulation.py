@@ -36,9 +36,9 @@ MOTION_STEP_PX = 0.1
 _CELL_US = 1000.0
 _CELLS = 4
 _BLOCK_US = _CELLS * _CELL_US
-_STRETCH = 8  # blocks
+_STRETCH_BLOCKS = 8  # blocks
 _FAR_PX = (3.0, 6.0, 12.0)  # distances beyond each of which the motion step doubles
-_SAME_DEPTH = 0.0026  # of the depth
+_DEPTH_STEP = 0.0026  # of the depth
 _MOST_MOVES = 40
 _MOST_MOVES_STRUCK = 400
 _BLOOM_EVERY = 8  # poses
@@ -408,8 +408,8 @@ class Simulation:
         camera, sensor = self.scene.camera, self.scene.sensor
         size = camera.width * camera.height
         # A key of the block, a draw and a purpose, as in `hash_normal`.
-        mix, key = cast(Any, _kernels.mix).py_func, np.array([self._model.seed])
-        key = mix(key + np.uint64(number) * np.array([_kernels.PIXEL_STEP], np.uint64))
+        mix_bits, key = cast(Any, _kernels.mix_bits).py_func, np.array([self._model.seed])
+        key = mix_bits(key + np.uint64(number) * np.array([_kernels.PIXEL_STEP], np.uint64))
         times, codes = [np.empty(0)], [np.empty(0, np.int64)]
         for purpose, rate_hz, population in (
             (10, 2 * sensor.noise_hz * size, size),
@@ -422,7 +422,7 @@ class Simulation:
             draws = np.arange(int(expected + 12 * math.sqrt(expected) + 64), dtype=np.uint64)
             words = key + draws * np.uint64(_kernels.DRAW_STEP)
             gap, place, sign = (
-                (mix(words + np.uint64(purpose + k)) >> np.uint64(11)) / 2**53 for k in range(3)
+                (mix_bits(words + np.uint64(purpose + k)) >> np.uint64(11)) / 2**53 for k in range(3)
             )
             t = np.cumsum(np.append(begin_us, -np.log(1.0 - gap) / rate))[1:]
             t = t[t < end_us]
@@ -506,10 +506,9 @@ class Simulation:
         return _Footprint(depth_m, blur, near, scale, z, light * across, light * along, halos)
 
     def _get_stretch(self, begin_us: float) -> _Stretch:
-        """Return the stretch with the block that starts at this time."""
         if self._stretch is None or not self._stretch.begin_us <= begin_us < self._stretch.end_us:
             # A pothole moves the image so fast that one block has poses enough.
-            blocks = 1 if self.scene.motion.pothole_s else _STRETCH
+            blocks = 1 if self.scene.motion.pothole_s else _STRETCH_BLOCKS
             end_us = min(begin_us + blocks * _BLOCK_US, self.scene.duration_s * 1e6)
             starts, middles = self._choose_poses(begin_us, end_us)
             position, attitude = self.path.sample(middles)
@@ -555,9 +554,9 @@ class Simulation:
             m = len(place) // 2
             depth_m = float(middle_depth[m])
             footprint = self._footprints.get(i)
-            if footprint is None or abs(depth_m / footprint.depth_m - 1) > _SAME_DEPTH:
+            if footprint is None or abs(depth_m / footprint.depth_m - 1) > _DEPTH_STEP:
                 # At the depth halfway through its time of use.
-                nearer = 1 + _SAME_DEPTH * float(np.sign(middle_depth[0] - middle_depth[-1]))
+                nearer = 1 + _DEPTH_STEP * float(np.sign(middle_depth[0] - middle_depth[-1]))
                 width_px = float(strip_px[m]) * nearer
                 footprint = self._make_footprint(source, depth_m / nearer, width_px, bounds[m] * nearer)
                 self._footprints[i] = footprint
@@ -602,8 +601,8 @@ class Simulation:
             line,
             _kernels.Strips(levels, origin, axis, bounds, strips, clusters, gain),
             _kernels.Halos(halo, *self._halo_columns),
-            _kernels.Near(self._near_share, tables, near_scale, near_reach),
-            _kernels.Scenery(turn, self._texture_every, self._texture, light),
+            _kernels.Cores(self._near_share, tables, near_scale, near_reach),
+            _kernels.Background(turn, self._texture_every, self._texture, light),
         )
         batches = _make_batches(pixels, masks, far, self._texture_every)
         at_px = undo_drops(scene.drops, *np.divmod(batches[0], camera.width), (begin_us + end_us) * 0.5e-6)
@@ -689,7 +688,6 @@ class Simulation:
 
 
 def _shift_requests(words: NDArray[np.int64], later_us: float) -> NDArray[np.int64]:
-    """Shift the time origin of packed requests to a later time."""
     # Requests that have waited for very long keep a time that fits into a word.
     ticks = np.maximum((words >> _kernels.CODE_BITS) - int(later_us * _kernels.TICKS), -(1 << 35))
     shifted: NDArray[np.int64] = ticks << _kernels.CODE_BITS | words & ((1 << _kernels.CODE_BITS) - 1)

@@ -148,10 +148,6 @@ def truth_path(url: Path | str) -> Path:
 def read_truth(path: Path | str, registry: Registry | None = None) -> Truth:
     """Read the truth of a recording from its `REC.truth.json`.
 
-    Args:
-        path: The file.
-        registry: The algorithms of its links; None for all that are installed.
-
     Raises:
         InputError: It cannot be read, is not a scene's truth, or has other codes than this installation; one
             line.
@@ -166,16 +162,10 @@ def truth_from_table(
     source: str = "truth",
     links: Mapping[str, Link] | None = None,
 ) -> Truth:
-    """Parse the JSON values of `REC.truth.json`.
+    """Parse the JSON values of `REC.truth.json`, called `source` in error messages.
 
     Bars of another generator without a link are taken to use the default link, but for their `profile`,
-    `clusters`, `frames` and `pilot_every`.
-
-    Args:
-        table: The JSON values.
-        registry: The algorithms of its links; None for all that are installed.
-        source: Name of the truth in error messages.
-        links: Links by digest, instead of those of the table.
+    `clusters`, `frames` and `pilot_every`. `links` are links by digest, instead of those of the table.
 
     Raises:
         InputError: It is not a scene's truth, or has other codes than this installation.

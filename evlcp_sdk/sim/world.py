@@ -57,10 +57,6 @@ def scene_to_enu(vectors: Floats, heading_deg: float) -> Floats:
 def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, ...]:
     """Return the bars of a scene as sites; the first bar is transmitter 1 unless it has an id.
 
-    Args:
-        scene: A scene with a `[world]`.
-        registry: The algorithms of its links; None for all that are installed.
-
     Raises:
         ConfigError: The scene has no `[world]`, or a bar's link is not valid.
     """
@@ -95,11 +91,6 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
 def survey_sites(scene: Scene, seed: int, registry: Registry | None = None) -> tuple[BarSite, ...]:
     """Return the sites of the bars as a survey reports them: with its errors, and with faults it is not aware
     of.
-
-    Args:
-        scene: A scene with a `[world]`.
-        seed: Seed of the errors.
-        registry: As in `sites_of`.
 
     Raises:
         ConfigError: The scene has no `[world]`, a bar's link is not valid, or its `site_of` is no bar.
@@ -138,12 +129,8 @@ def locate_camera(scene: Scene, position_m: Floats, attitude_rad: Floats) -> dic
     """Return geodetic positions and attitudes of the camera as lists, one entry a time.
 
     The keys are latitude_deg, longitude_deg, height_m; heading_deg clockwise from north, pitch_deg up,
-    roll_deg with the camera's top to the right.
-
-    Args:
-        scene: A scene with a `[world]`.
-        position_m: Positions in the scene's axes, float64 (n, 3).
-        attitude_rad: Yaw, pitch, roll in the scene, float64 (n, 3).
+    roll_deg with the camera's top to the right. Positions and (yaw, pitch, roll), float64 (n, 3), are in the
+    scene's axes.
 
     Raises:
         ConfigError: The scene has no `[world]`.
@@ -163,15 +150,9 @@ def locate_camera(scene: Scene, position_m: Floats, attitude_rad: Floats) -> dic
 
 
 def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeLog | None:
-    """Return an IMU's log of the camera's attitude, every millisecond, with its errors and unknown faults.
+    """Return an IMU's log of the camera's attitude, every millisecond, None if `world.attitude` is "none".
 
-    Args:
-        scene: A scene with a `[world]`.
-        seed: Seed of the errors, which are constant over a recording.
-        path: The camera's path.
-
-    Returns:
-        The log; None if `world.attitude` is "none".
+    Its errors are constant over a recording, and it may have faults it is not aware of.
 
     Raises:
         ConfigError: The scene has no `[world]`.

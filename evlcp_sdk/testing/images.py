@@ -33,7 +33,6 @@ def _expect_array(value: object, dtype: type, shape: tuple[int, ...], name: str)
 
 
 def _permute_pilots(book: Codebook) -> tuple[NDArray[np.int64], Codebook]:
-    """Return another order of the pilots, and the codebook with this order."""
     order = np.random.default_rng(1).permutation(book.clusters)
     return order, Codebook(book.profile, book.preamble, book.pilots[order], book.codewords)
 
@@ -209,7 +208,6 @@ DECODING = (
 def _measure(
     subject: Subject, cluster_px: int = 8, seed: int = 0, right_down: tuple[int, int] = (0, 0)
 ) -> Range:
-    """Return the range that the subject measures in an ideal image."""
     link = link_of(subject)
     require_column(link)
     symbols = symbols_of(link.codebook, seed)

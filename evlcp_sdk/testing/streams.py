@@ -236,12 +236,10 @@ SYNCHRONIZATION = (
 
 
 def _make_line(frames: int) -> Any:
-    """Return a straight line, float64 (frames, 1)."""
     return (50.0 - 8.0 * np.arange(frames) * FRAME_US * 1e-6)[:, None]
 
 
 def _make_noisy_line(n: int, frames: int = 200) -> Any:
-    """Return the line with noise of 0.1, float64 (frames, n)."""
     return _make_line(frames) + np.random.default_rng(0).normal(0, 0.1, (frames, n))
 
 

@@ -69,14 +69,7 @@ def ideal_sums(
 def ideal_presence(
     clusters: int, *, cluster_px: int = 8, width_px: int = 6, offset_px: tuple[int, int] = (0, 0)
 ) -> PresenceMap:
-    """Return the presence map of the same image by a perfect separation.
-
-    Args:
-        clusters: Number of clusters.
-        cluster_px: Spacing of the clusters, a multiple of the grid, px.
-        width_px: Width of the bar, a multiple of the grid, px.
-        offset_px: As in `ideal_sums`, multiples of the grid.
-    """
+    """Return the presence map of the same image by perfect separation; lengths are multiples of `GRID_PX`."""
     shown = _draw_clusters(clusters, cluster_px, width_px, offset_px)
     pixels = shown == np.arange(clusters)[:, None, None]
     cells = pixels[:, ::GRID_PX, ::GRID_PX]
@@ -88,13 +81,8 @@ def ideal_frame(
 ) -> tuple[Any, ...]:
     """Return the inputs of a decoding for one ideal frame: `decode(*ideal_frame(book, symbols))`.
 
-    Args:
-        codebook: The codes.
-        symbols: Symbols of the clusters, top first, (K,).
-        after: The chip of each cluster after the frame, (K,) or one for all, -1 if unknown; pair codes have
-            none.
-        missing: Share of the events that are missing.
-        seed: Seed of the missing events.
+    Arguments are as in `ideal_sums`; `after` may be -1, for an unknown chip, and is for other than pair
+    codes.
 
     Returns:
         The presence and the polarity sums; except for pair codes also the chips before the info segment and

@@ -70,14 +70,10 @@ def open_bag(url: str) -> "BagSource":
 
 
 class BagSource(RawSource):
-    """Reads the events of a bag's topic, its packets as one stream of words.
+    """Reads the events of a bag's topic (None: the only one), its packets as one stream of words.
 
     Packets that are out of order by up to a few hundred are sorted by their numbers; repeated ones are left
     out and counted (`packets_twice`), and missing ones are the loss `packets_lost`.
-
-    Args:
-        path: The bag.
-        topic: The topic; None for the only one.
     """
 
     def __init__(self, path: Path | str, topic: str | None = None) -> None:
@@ -114,10 +110,8 @@ class BagSource(RawSource):
 
 
 class _PacketOrder:
-    """Sorts packets by their numbers, each once; a number far below starts anew, as a driver does.
-
-    Args:
-        packets: The packets in the order of the bag.
+    """Sorts the packets of a bag by their numbers, each once; a number far below starts anew, as a driver
+    does.
 
     Attributes:
         twice: Number of repeated packets, which are left out.
@@ -228,7 +222,6 @@ def _list_files(path: Path) -> list[Path]:
 
 
 def _read_bag(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    """Return the packets of a bag, file by file."""
     if not path.exists():
         raise InputError(f"{path}: No such file or directory")
     files = _list_files(path)
@@ -248,7 +241,6 @@ def _read_bag(path: Path, topic: str | None, stack: ExitStack) -> Iterator[Event
 
 
 def _choose_topic(path: Path, topics: dict[str, str], topic: str | None) -> str:
-    """Choose the topic to read by the types of topics."""
     fitting = [name for name, kind in topics.items() if kind in TYPES]
     names = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none"
     if topic is not None:

@@ -23,12 +23,9 @@ UNKNOWN_SIZE = (0xFFFF, 0xFFFF)
 
 
 class FaerySource(EventSource):
-    """Reads a file by `faery`; contrast-detection events only, no triggers.
+    """Reads a file by `faery`, its suffix the format; contrast-detection events only, no triggers.
 
     What `faery` skips silently, such as the rest of a DAT file cut within an event, is in no loss.
-
-    Args:
-        path: The file; its suffix is the format.
 
     Raises:
         InputError: `faery` is not installed, or cannot read the file.

@@ -110,7 +110,6 @@ class _DataSet:
 
 
 def _find_columns(path: Path, file: Any, order: Fields | None) -> tuple[list[Array], Fields]:
-    """Find the columns time, polarity and perhaps x and y."""
     at, node = _find_table(path, file)
     is_group = isinstance(node, h5py.Group)
     names = [name for name in node if _is_hard_link(node, name)] if is_group else list(node.dtype.names or ())

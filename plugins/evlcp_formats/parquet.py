@@ -56,5 +56,4 @@ class FramesParquet(Sink):
 
 
 def _to_json(value: Any) -> Any:
-    """Return a value, or None for NaN and infinity."""
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -25,10 +25,7 @@ _PACKET_US: Final = 10_000
 
 
 class RosBag:
-    """Writes messages of ROS 2 into one MCAP file, as `ros2 bag play` reads it.
-
-    Args:
-        file: The file; not closed.
+    """Writes messages of ROS 2 into one MCAP file, as `ros2 bag play` reads it; the file is not closed.
 
     Raises:
         ConfigError: `mcap` or `rosbags` is not installed.

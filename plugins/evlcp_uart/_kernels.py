@@ -10,10 +10,10 @@ from evlcp_sdk.kernels import njit
 
 Column = NDArray[Any]
 
-_NOTHING = 30.0
+_NEGLIGIBLE = 30.0
 """Nats below the likeliest context at which others are neglected: 1e-13, with outliers of a thousandth."""
 
-_AT_ONCE = 64
+_GROUP_TICKS = 64
 """Ticks whose words are scored together, in vector instructions."""
 
 
@@ -70,7 +70,7 @@ def compute_bit_evidence(
             top = max(top, score[c])
         for c in range(contexts):
             # Lower ones are negligible against an outlier.
-            near = score[c] > top - _NOTHING
+            near = score[c] > top - _NEGLIGIBLE
             out[s, c] = math.log((1 - outlier) * math.exp(score[c] - top) + outlier) if near else least
         last = out[s, contexts - 1]
         for c in range(contexts):
@@ -105,10 +105,10 @@ def score_characters(
         for c in range(contexts):
             likely[c, s] = math.exp(evidence[s, c] - tops[s])
     # A state is the parity of the ones so far, and the last bits.
-    states = np.empty((2, 2, contexts // 2, _AT_ONCE))
-    sums = np.empty(_AT_ONCE)
-    for first in range(0, len(out), _AT_ONCE):
-        some = out[first : first + _AT_ONCE]
+    states = np.empty((2, 2, contexts // 2, _GROUP_TICKS))
+    sums = np.empty(_GROUP_TICKS)
+    for first in range(0, len(out), _GROUP_TICKS):
+        some = out[first : first + _GROUP_TICKS]
         _score_words(by_context, places, bits, parity, True, first, states, some)
         # The mean over all words matters only if a character is possible.
         if not likeliest and some.max() > 0:

@@ -40,7 +40,7 @@ _UNFRAMED_BITS = 10.0
 
 _LEARN_EVENTS, _LEARN_CHARACTERS = 2400, 16
 """Events and characters to learn a light from; more of a bright one take longer and add nothing. The events
-are 30 an edge, `_ENOUGH` of a window, with five edges a character."""
+are 30 an edge, `_MOST_EVENTS` of a window, with five edges a character."""
 
 _TRIED, _ROUNDS = 4, 5
 """Guesses of the light to refine, and how often each is learned again."""
@@ -52,10 +52,10 @@ _LINE = 8.5
 """Least ratio of the line of bits to the median of the spectrum around it: noise of two polarities, at a
 hundred frequencies, reaches it in one of a thousand stretches."""
 
-_FINE = 4
+_OVERSAMPLING = 4
 """Frequencies per resolution of a stretch."""
 
-_SHIFTS, _AS_GOOD = range(-14, 15, 2), 0.01
+_SHIFTS, _SHIFT_TOLERANCE = range(-14, 15, 2), 0.01
 """Shifts of bits to try, ticks, as a burst should lie within the window of its bit: the latest is taken that
 tells as much, but for this share."""
 
@@ -187,7 +187,7 @@ def _learn_candidates(
 
 def _find_clock(counts: NDArray[np.int32]) -> float | None:
     """Return the length of a bit by the line in the spectrum of edges, None without one."""
-    size = _FINE * counts.shape[1]
+    size = _OVERSAMPLING * counts.shape[1]
     power = (np.abs(np.fft.rfft(counts, size)) ** 2).sum(0)
     first, last = (int(size / (TICKS * (1 + off))) for off in (CLOCK_SHARE, -CLOCK_SHARE))
     band = power[first : last + 1]
@@ -208,7 +208,7 @@ def _align_bursts(
         learned = light.learn(windows, contexts, 0.0, light.rate)
         found.append((learned.mutual_information(windows, contexts), learned))
     most = max(score for score, _ in found)
-    most -= _AS_GOOD * abs(most)
+    most -= _SHIFT_TOLERANCE * abs(most)
     return [learned for score, learned in found if score >= most][-1]
 
 

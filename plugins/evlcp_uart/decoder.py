@@ -23,16 +23,16 @@ from evlcp_uart.reader import LEAST_CHARACTERS, NEAR, TAIL, CharacterReader, Str
 _BLOCK = 32
 """Characters of a block without pauses; a stretch of blocks is decoded at once."""
 
-_MORE, _SURE = 4, 0.95
+_DIM_BLOCKS, _CLEAR_QUALITY = 4, 0.95
 """Blocks of a stretch if the mean quality of one block is lower than this: dim light takes long to learn."""
 
 _BEFORE_FIRST = TICKS
 """Ticks before a stream's first event that are known by it, as it may be of an edge."""
 
-_LAST_SURE = 0.95
+_LEAST_LAST_QUALITY = 0.95
 """Least quality of a last character that extends beyond the last event."""
 
-_AHEAD = 4
+_LOOKAHEAD = 4
 """Characters of lookahead: only those after it tell where one starts."""
 
 _LEAST_EVENTS = 24
@@ -44,13 +44,13 @@ _LEAST_FIRST_QUALITY = 0.85
 _MEMORY = 0.97
 """Weight of earlier learning after a block."""
 
-_SELDOM = 8
+_SEARCH_PERIOD = 8
 """Stretches from one search for light to the next, if there is none."""
 
 _BUNCH_EVENTS, _BUNCH_TICKS = 6.0, TICKS // 2
 """Least weighted events per tick of bunches of a readout, and their largest spacing, less than of edges."""
 
-_LOST = 8
+_MOST_EMPTY = 8
 """Stretches with events and without a character after which the light is learned again."""
 
 
@@ -119,7 +119,7 @@ class CharacterState:
 class CharacterDecoder:
     """Decodes characters from times and polarities, step by step.
 
-    Args:
+    Attributes:
         reader: The reader of a stretch.
         bit_us: Nominal length of a bit, us.
         mark_on: Whether the light is on for a mark, which is 1 and idle.
@@ -136,18 +136,15 @@ class CharacterDecoder:
     def step(
         self, state: CharacterState, t_us: Ticks, p: NDArray[np.uint8], until_us: float
     ) -> tuple[CharacterState, list[Character]]:
-        """Add the events up to a time; return the new state and the characters that are certain by then.
+        """Count the events before `until_us`, after which none of them may come; decode what is certain by
+        then.
 
-        Args:
-            state: The state of `init` or the last `step`; not changed.
-            t_us: Event times, ascending, int64 (n,).
-            p: Polarities, uint8 (n,).
-            until_us: All events before this time have come.
+        `t_us` are ascending times, int64 (n,), `p` polarities, uint8 (n,). The given state is not changed.
         """
         state = self._count_events(state, t_us, p, until_us)
         found: list[Character] = []
-        while state.counts.shape[1] >= state.blocks * self._block + self._ahead:
-            state, more = self._decode_stretch(state, state.blocks * self._block)
+        while state.counts.shape[1] >= state.blocks * self._block_ticks + self._lookahead_ticks:
+            state, more = self._decode_stretch(state, state.blocks * self._block_ticks)
             found += more
         return state, found
 
@@ -159,12 +156,12 @@ class CharacterDecoder:
         return self._decode_stretch(state, n, last=True)
 
     @property
-    def _block(self) -> int:
+    def _block_ticks(self) -> int:
         return _BLOCK * self.reader.length
 
     @property
-    def _ahead(self) -> int:
-        return _AHEAD * self.reader.length + TAIL
+    def _lookahead_ticks(self) -> int:
+        return _LOOKAHEAD * self.reader.length + TAIL
 
     def _count_events(
         self, state: CharacterState, t_us: Ticks, p: NDArray[np.uint8], until_us: float
@@ -206,29 +203,29 @@ class CharacterDecoder:
         if state.light is None and enough:
             # A search takes long, so it becomes rarer the longer there is no light.
             light, other, tried = None, False, state.tried
-            if tried & (tried - 1) == 0 or tried % _SELDOM == 0:
+            if tried & (tried - 1) == 0 or tried % _SEARCH_PERIOD == 0:
                 light, other = acquire_light(self.reader, self.mark_on, stretch)
             if light is None and not other and state.blocks == 1 and not last:
-                return replace(state, blocks=_MORE), []
-            tried = 0 if light is not None else max(tried, _SELDOM // 2 if other else 0) + 1
+                return replace(state, blocks=_DIM_BLOCKS), []
+            tried = 0 if light is not None else max(tried, _SEARCH_PERIOD // 2 if other else 0) + 1
             after = replace(after, light=light, tried=tried)
         if after.light is None:
             return replace(after, tally=_add_counts(state.tally, stretches_without_light=int(enough))), []
         after, found, sure = self._read_characters(after, stretch, due, last, is_new=state.light is None)
-        if state.light is None and sure < _SURE and state.blocks == 1 and not last:
-            return replace(state, blocks=_MORE), []
+        if state.light is None and sure < _CLEAR_QUALITY and state.blocks == 1 and not last:
+            return replace(state, blocks=_DIM_BLOCKS), []
         if after.start == state.first + stretch.start and enough:
             # No character started.
-            lost = state.empty_stretches + 1 >= _LOST
+            lost = state.empty_stretches + 1 >= _MOST_EMPTY
             light, empty_stretches = (None, 0) if lost else (after.light, state.empty_stretches + 1)
             after = replace(after, light=light, empty_stretches=empty_stretches)
-        return replace(after, blocks=1 if sure >= _SURE else _MORE), found
+        return replace(after, blocks=1 if sure >= _CLEAR_QUALITY else _DIM_BLOCKS), found
 
     def _prepare_stretch(self, state: CharacterState, due: int, last: bool) -> tuple[Stretch, int]:
         """Return the stretch for the first `due` ticks, and over how many ticks its events are spread."""
         assert state.first is not None
         # With the same lookahead any split of the stream gives the same result.
-        counts, spread = state.counts[:, : due + self._ahead], state.spread
+        counts, spread = state.counts[:, : due + self._lookahead_ticks], state.spread
         if state.light is None:
             spread = _find_bunch_spacing(counts[:, :due])
             # A resolution that becomes known later is not used yet, in whatever pieces events come.
@@ -254,7 +251,7 @@ class CharacterDecoder:
         assert after.light is not None
         # The stretch is read with the light that it teaches itself.
         starts, evidence, _ = self.reader.find_path(stretch, after.light, False)
-        memory = _MEMORY ** (due / self._block)
+        memory = _MEMORY ** (due / self._block_ticks)
         light = self.reader.learn_light(stretch, after.light, starts, evidence, memory)
         starts, evidence, score = self.reader.find_path(stretch, light, False)
         starts = starts[starts < due]
@@ -264,7 +261,7 @@ class CharacterDecoder:
         if last and found:
             # The last edge of a character may be that before its first stop bit.
             needs = int(kept[-1]) + (self.reader.characters.bits - self.reader.characters.stop_bits) * TICKS
-            if needs >= stretch.end and (found[-1].quality < _LAST_SURE or found[-1].wrong_parity):
+            if needs >= stretch.end and (found[-1].quality < _LEAST_LAST_QUALITY or found[-1].wrong_parity):
                 found.pop()
         by_chance, ambiguous = 0, 0
         if is_new:
@@ -300,11 +297,7 @@ def _add_counts(tally: dict[str, int], **more: int) -> dict[str, int]:
 
 
 def _find_bunch_spacing(counts: NDArray[np.int32]) -> int:
-    """Return the spacing in ticks of the bunches in which a camera reads events out; 1 without bunches.
-
-    Args:
-        counts: Events of each tick, OFF and ON, int32 (2, n).
-    """
+    """Return the spacing in ticks of the bunches in which a camera reads events out; 1 without bunches."""
     total = counts.sum(0)
     at = np.flatnonzero(total)
     many, apart = total[at], np.diff(at)

@@ -24,11 +24,11 @@ _BAND_HZ = 250.0, 30_000.0
 _BIN_US, _MOST_BINS = 16, 1 << 18
 """Width of a bin for the spectrum, and most bins, 4 s."""
 
-_LINES, _HALF = 4, 0.5
+_LINES, _LEAST_LINE_SHARE = 4, 0.5
 """Lines to try, and their least height as a share of the highest: if bursts are as wide as a bit, the lines
 of start and stop bits may be higher than that of all bits."""
 
-_AS_HIGH = 0.75
+_LEAST_FUNDAMENTAL = 0.75
 """Least height of a fundamental line relative to its multiple; a line between bins is lower."""
 
 _LEARN_BITS, _MOST_BITS, _LEAST_BITS = 256, 2048, 64
@@ -43,26 +43,26 @@ _EDGES = np.arange(CONTEXTS) % 4 % 3 > 0
 _PAUSE_BITS = 16
 """Bits next to an edge that are known by it; one of some hundred edges is missed."""
 
-_LEAST = 1e-3
+_LEAST_PROBABILITY = 1e-3
 """Least probability of a bit: even a clear one may be of a damaged character."""
 
-_AT_ONCE = 0.9
+_SUCCESSIVE_SHARE = 0.9
 """Expected share of characters that follow another without a pause."""
 
-_SURE_BITS = 23.0
+_LEAST_EVIDENCE_BITS = 23.0
 """Least evidence for a format, bits. With random bits a likelihood ratio is above 2^n less often than 2^-n:
 with 240 formats for each of three rates, in one of ten thousand recordings."""
 
-_NEAR = 0.9
+_ALTERNATIVE_SHARE = 0.9
 """Least evidence for an alternative format, as a share of that for the best: a format with a fixed bit less
 has three quarters at most, and a character lost at the end of a pause costs some."""
 
-_COMMON = np.isin(np.arange(512), [0x20, *range(0x61, 0x7B)])
+_TEXT_CODES = np.isin(np.arange(512), [0x20, *range(0x61, 0x7B)])
 """Blanks and small letters, most of any text."""
 
 
 @dataclass(frozen=True)
-class _Inferred:
+class _RatedFormat:
     """A format, and the evidence for it.
 
     Attributes:
@@ -97,10 +97,10 @@ def infer_format(t_us: Ticks, p: NDArray[np.uint8]) -> tuple[dict[str, Any], str
     ranked = max(_rank_formats(t_us, p), key=lambda formats: formats[0].bits, default=[])
     if not ranked:
         return {}, f"{none}{len(t_us)} events are too few"
-    if ranked[0].bits < _SURE_BITS:
-        return {}, f"{none}at best {ranked[0].rate_hz:g} baud, {ranked[0]}, {_SURE_BITS:g} needed"
+    if ranked[0].bits < _LEAST_EVIDENCE_BITS:
+        return {}, f"{none}at best {ranked[0].rate_hz:g} baud, {ranked[0]}, {_LEAST_EVIDENCE_BITS:g} needed"
     # Text of eight bits fits in either order of bits, but reads as text in one.
-    near = [one for one in ranked if one.score >= _NEAR * ranked[0].score]
+    near = [one for one in ranked if one.score >= _ALTERNATIVE_SHARE * ranked[0].score]
     best = max(near, key=lambda one: one.common)
     other = ranked[1] if best is ranked[0] else ranked[0]
     form = best.form
@@ -115,14 +115,16 @@ def infer_format(t_us: Ticks, p: NDArray[np.uint8]) -> tuple[dict[str, Any], str
     return {"air.chip_rate_hz": best.rate_hz} | {f"framing.{key}": v for key, v in framing.items()}, summary
 
 
-def _rank_formats(t_us: Ticks, p: NDArray[np.uint8]) -> Iterator[list[_Inferred]]:
+def _rank_formats(t_us: Ticks, p: NDArray[np.uint8]) -> Iterator[list[_RatedFormat]]:
     """Yield all formats, the best first, for each possible rate, by the stretch with most events."""
     for rate_hz in _find_rates(t_us, p):
         counts = _count_events((t_us - t_us[0]) * (1e-6 * TICKS * rate_hz), p, _LEARN_BITS * TICKS)
         blocks = counts.reshape(2, -1, _LEARN_BITS * TICKS).swapaxes(0, 1)
         many = _MOST_BITS // _LEARN_BITS
         first = int(np.convolve(blocks.sum((1, 2)), np.ones(many))[many - 1 :].argmax())
-        ones = np.clip(_estimate_marks(blocks[first : first + many]), _LEAST, 1 - _LEAST)
+        ones = np.clip(
+            _estimate_marks(blocks[first : first + many]), _LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY
+        )
         if len(ones) >= _LEAST_BITS:
             formats = [
                 _assess_format(Characters(*form), float(f"{rate_hz:.4g}"), idle, marks)
@@ -149,7 +151,7 @@ def _find_rates(t_us: Ticks, p: NDArray[np.uint8]) -> Iterator[float]:
     step_hz = 1e6 / (2 * counts.shape[1] * bin_us)
     hz = np.arange(len(power)) * step_hz
     remaining = np.where((hz > _BAND_HZ[0]) & (hz < min(_BAND_HZ[1], 0.4e6 / bin_us)), power, 0.0)
-    least = _HALF * remaining.max()
+    least = _LEAST_LINE_SHARE * remaining.max()
     for _ in range(_LINES):
         top = int(remaining.argmax())
         if remaining[top] <= 0 or remaining[top] < least:
@@ -157,7 +159,7 @@ def _find_rates(t_us: Ticks, p: NDArray[np.uint8]) -> Iterator[float]:
         for part in range(int(hz[top] / _BAND_HZ[0]), 0, -1):
             near = round(top / part) + np.arange(-2, 3)
             line = int(near[remaining[near].argmax()])
-            if remaining[line] >= _AS_HIGH * remaining[top]:
+            if remaining[line] >= _LEAST_FUNDAMENTAL * remaining[top]:
                 break
         before, here, after = power[line - 1 : line + 2]
         curvature = before - 2 * here + after
@@ -208,10 +210,9 @@ def _log_likelihoods(counts: NDArray[np.int32], light: Light) -> Floats:
 
 
 def _decode_bits(logs: Floats) -> tuple[int, float, Floats]:
-    """Decode bits of any order: return their phase, their log-likelihood, and their contexts, (n, C).
+    """Decode bits of any order by log-likelihoods of their contexts for each phase, (n, phases, C).
 
-    Args:
-        logs: Log-likelihood of each context of each bit for each phase of bits, (n, phases, C).
+    Returns their phase, their log-likelihood, and their contexts, (n, C).
     """
     top = logs.max(2, keepdims=True)
     likely, score = np.exp(logs - top), top.sum((0, 2))
@@ -231,7 +232,7 @@ def _decode_bits(logs: Floats) -> tuple[int, float, Floats]:
     return best, float(score[best]), contexts
 
 
-def _assess_format(form: Characters, rate_hz: float, idle: str, marks: Floats) -> _Inferred:
+def _assess_format(form: Characters, rate_hz: float, idle: str, marks: Floats) -> _RatedFormat:
     """Return the evidence for a format by how likely each bit is a mark, float64 (n,)."""
     from evlcp_uart import _kernels
 
@@ -240,12 +241,15 @@ def _assess_format(form: Characters, rate_hz: float, idle: str, marks: Floats) -
     fixed = np.log(2 * words[:, bits - form.stop_bits :]).sum(1)
     if form.parity != "none":
         balance = (1 - 2 * words[:, 1 : 2 + form.data_bits]).prod(1)
-        fixed += np.log(np.maximum(1 + balance * (1 if form.parity == "even" else -1), _LEAST))
+        fixed += np.log(np.maximum(1 + balance * (1 if form.parity == "even" else -1), _LEAST_PROBABILITY))
     # In pauses each bit may be a start bit. Characters at both ends are cut.
     pause = np.log(marks)
     pause[:bits] = pause[-bits:] = 0
     scores = fixed + np.log(2 - 2 * words[:, 0]) - np.convolve(pause, np.ones(bits), "valid")
-    tails, costs = np.full(len(marks), np.log(2 - 2 * _AT_ONCE)), (np.log(2), -np.log(_AT_ONCE), 0.0)
+    tails, costs = (
+        np.full(len(marks), np.log(2 - 2 * _SUCCESSIVE_SHARE)),
+        (np.log(2), -np.log(_SUCCESSIVE_SHARE), 0.0),
+    )
     starts, score = _kernels.find_best_path(scores, tails, bits, 0, 0, *costs, 0, 0.0)
     stray = marks < 0.5
     stray[(starts[:, None] + np.arange(bits)).ravel()] = stray[:bits] = stray[-bits:] = False
@@ -253,8 +257,8 @@ def _assess_format(form: Characters, rate_hz: float, idle: str, marks: Floats) -
     values, turned = data @ (1 << places), data @ (1 << places[::-1])
     pairs = np.unique(512 * values[:-1] + values[1:], return_counts=True)[1]
     new = pairs.sum() / (pairs @ pairs) if len(pairs) else 0.0
-    common, other = int(_COMMON[values].sum()), int(_COMMON[turned].sum())
-    return _Inferred(
+    common, other = int(_TEXT_CODES[values].sum()), int(_TEXT_CODES[turned].sum())
+    return _RatedFormat(
         replace(form, first="highest") if other > max(common, len(values) / 2) else form,
         rate_hz,
         idle,

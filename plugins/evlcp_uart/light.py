@@ -33,10 +33,10 @@ OUTLIER = 2e-3
 _PRIOR_WINDOWS, _PRIOR_GAINS = 3.0, 12.0
 """Weights, in windows of a context, of those with the same last bits, and of the prior shares."""
 
-_ENOUGH = 30.0
+_MOST_EVENTS = 30.0
 """Events of a window that tell all; of more, each has less weight, as pixels share the light."""
 
-_COUNTED = 0.85
+_MOST_WEIGHT = 0.85
 """Most weight of an event: light is learned from the bits that are read with it, and the events of a pixel
 are correlated."""
 
@@ -73,7 +73,7 @@ class Light:
     gains: Floats
     rate: float = 1.0
     paused: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    most: float = _COUNTED
+    most: float = _MOST_WEIGHT
     inverted: bool = False
 
     @property
@@ -106,7 +106,7 @@ class Light:
         """Weight of an event."""
         # Events of all contexts have other causes than the light.
         informative = self.rates - self.rates.min(0)
-        return min(self.most, _ENOUGH / max(float(informative.sum((1, 2)).max()), 1e-9))
+        return min(self.most, _MOST_EVENTS / max(float(informative.sum((1, 2)).max()), 1e-9))
 
     @cached_property
     def logs(self) -> Floats:
@@ -162,12 +162,7 @@ class Light:
         return self.context_likelihoods(windows)[0] - log_sum_exp(score)[:, None]
 
     def mutual_information(self, windows: Floats, contexts: Floats) -> float:
-        """Return the mutual information of the events of bits and their contexts, summed, nats.
-
-        Args:
-            windows: Events of each bit, float64 (n, 2, TICKS).
-            contexts: Probability of each context of a bit, float64 (n, C).
-        """
+        """Return the mutual information of the events (n, 2, TICKS) and contexts (n, C) of bits, nats."""
         likely = _normalize_likelihoods(self.context_likelihoods(windows)[0])
         any_of = likely @ contexts.mean(0)
         found: float = (contexts * np.log(likely + 1e-300)).sum() - np.log(any_of + 1e-300).sum()
@@ -201,12 +196,7 @@ class Light:
 
 
 def guess_lights(counts: NDArray[np.int32], mark_on: bool) -> Iterator[Light]:
-    """Yield guesses of a light before anything is known of it.
-
-    Args:
-        counts: Events of each tick, OFF and ON, int32 (2, n).
-        mark_on: Whether the light is on for a mark.
-    """
+    """Yield guesses of a light, on or off for a mark, by events of each tick, OFF and ON, int32 (2, n)."""
     n = counts.shape[1]
     ticks = np.arange(2 * TICKS)
     total = counts.sum(1) + 1.0

@@ -62,12 +62,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class CharacterReader:
-    """Reads characters of one format.
-
-    Args:
-        characters: The format.
-        pause_bits: Pause before a packet; 0 if it is unknown.
-    """
+    """Reads characters of one format, with a pause before each packet; `pause_bits` is 0 if it is unknown."""
 
     characters: Characters
     pause_bits: int = 0
@@ -115,7 +110,6 @@ class CharacterReader:
     def _find_best_path(
         self, scores: Floats, evidence: Floats, stretch: Stretch, light: Light
     ) -> tuple[Ticks, float]:
-        """Return the starts of the characters that explain a stretch best, and their score."""
         from evlcp_uart import _kernels
 
         length = round(self.length * light.rate)
@@ -214,7 +208,6 @@ class CharacterReader:
         return windows, contexts[inside]
 
     def _estimate_rate(self, light: Light, starts: Ticks, evidence: Floats, memory: float) -> float:
-        """Estimate the relative length of a bit from these characters."""
         weight = memory * light.learned_bits
         apart = np.diff(starts)
         at_once = np.abs(apart - self.length * light.rate) <= NEAR + 1
@@ -254,7 +247,6 @@ class CharacterReader:
 
 
 def _sum_neighbours(values: Floats) -> Floats:
-    """Sum each row with its neighbours, float64 (n, m)."""
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, 0)])
     k = np.arange(len(values))
     found: Floats = (

@@ -34,7 +34,7 @@ def test_what_is_worked_out_anew_less_often_changes_next_to_no_event(monkeypatch
     assert set(block[0].strides.tolist()) == {1, 2, 4, 8}
     coarse = every(scene)
     monkeypatch.setattr(simulation, "_FAR_PX", ())
-    monkeypatch.setattr(simulation, "_SAME_DEPTH", 0.0)
+    monkeypatch.setattr(simulation, "_DEPTH_STEP", 0.0)
     fine = every(scene)
     assert len(coarse) == pytest.approx(len(fine), rel=1e-3)
     # By the distance from the bar, px: within four sigmas of as many events that are drawn apart.
