@@ -169,7 +169,7 @@ def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
     names = [member.removesuffix(".npy") for member in archive.namelist() if member.endswith(".npy")]
     size, unpacked = path.stat().st_size, sum(member.file_size for member in archive.infolist())
     if unpacked > _MOST_RATIO * size + _SMALL_BYTES:
-        raise InputError(f"{path}: {size} bytes are said to unpack to {unpacked}, more than events can")
+        raise InputError(f"{path}: {size} bytes are declared to unpack to {unpacked}, more than events can")
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="evlcp-"))
 
     def array(name: str) -> NDArray[Any]:

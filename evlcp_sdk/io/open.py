@@ -25,7 +25,7 @@ from evlcp_sdk.values import Events, Triggers
 if TYPE_CHECKING:
     from evlcp_sdk.io import camera, lists
 else:
-    # What most runs do not read.
+    # Most runs need neither.
     camera, lists = (LazyModule(f"evlcp_sdk.io.{name}") for name in ("camera", "lists"))
 
 T = TypeVar("T")

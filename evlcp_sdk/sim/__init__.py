@@ -42,7 +42,7 @@ _HOMES = {
     "truth": "SentBar Truth read_truth truth_from_table truth_path",
     "world": "sites_of",
 }
-"""Where each name is: what renders takes half a second to import, for which no truth waits."""
+"""The module of each name: rendering takes half a second to import, which reading a truth does not need."""
 
 __all__ = sorted(" ".join(_HOMES.values()).split())
 

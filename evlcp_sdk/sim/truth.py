@@ -30,7 +30,7 @@ _MOST_PPM = 1e5
 
 @dataclass(frozen=True, eq=False)
 class SentBar:
-    """What one bar sent, and where it was.
+    """The symbols of a bar, its link, and its place over time.
 
     Attributes:
         link: The link that it was sent with.
@@ -90,7 +90,7 @@ class Truth:
         t0_us: Camera clock as the scene starts, us.
         duration_us: Length of the scene, us.
         t_us: Times of the samples, from the scene's start, us, float64 (n,).
-        bars: What each bar sent, and where it was.
+        bars: Truth of each bar.
         sites: Sites of the bars on earth; none without a `[world]`.
         camera_path: Arrays of the camera at `t_us`: latitude_deg, longitude_deg, height_m, heading_deg,
             pitch_deg, roll_deg, float64 (n,), in a scene on earth; position_m and attitude_deg, float64

@@ -1,4 +1,4 @@
-"""What laws test an algorithm with: its link, what it compiles to, and one simple task a role."""
+"""Links and compiled algorithms for laws, and one simple task a role."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -177,6 +177,6 @@ def _check_dataset(path: Path, dataset: Any) -> None:
     size_bytes = path.stat().st_size
     if dataset.size * dataset.dtype.itemsize > _MOST_RATIO * size_bytes:
         raise InputError(
-            f"{path}: {dataset.name} is said to have {dataset.size} values, more than"
+            f"{path}: {dataset.name} is declared to have {dataset.size} values, more than"
             f" {size_bytes} bytes can hold"
         )

@@ -85,7 +85,7 @@ class CharacterReader:
         found = np.empty((counts.shape[1] - TICKS + 1, CONTEXTS))
         logs = np.ascontiguousarray(light.share * light.logs.transpose(1, 2, 0))
         _kernels.compute_bit_evidence(counts, logs, LOG_GAINS, light.means, light.share, OUTLIER, found)
-        # What there was before the first event, or behind the last, nothing tells.
+        # There is no evidence before the first event and after the last.
         found[: max(stretch.known_from - EARLY, 0)] = 0
         found[max(stretch.end, 0) :] = 0
         return found
