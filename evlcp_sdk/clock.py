@@ -67,6 +67,7 @@ class CameraClock:
 
     Attributes:
         last_us: Stream time of the newest event, us; long ago before the first.
+        counts: Events fed and dropped, and confirmed leaps forward and back.
         firsts: Number of the first event, from 0, of each count of dropped ones.
 
     >>> clock = CameraClock(1280, 720)
@@ -88,12 +89,7 @@ class CameraClock:
         self._held: list[Events] = []
         self._first_held = 0
         self.firsts: dict[str, int] = {}
-        self._counts = dict.fromkeys(("events", *_DROPPED, "clock_leaps", "clock_restarts"), 0)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Events fed and dropped, and confirmed leaps forward and back."""
-        return dict(self._counts)
+        self.counts = dict.fromkeys(("events", *_DROPPED, "clock_leaps", "clock_restarts"), 0)
 
     def camera_us(self, t_us: float) -> float:
         """Convert stream time to the camera's clock, us."""
@@ -105,7 +101,7 @@ class CameraClock:
     def feed(self, events: Events) -> list[Events]:
         """Add the next events of the stream; return those that are kept, in stream time."""
         t_us, x, y, p = events.t_us, events.x, events.y, events.p
-        self._counts["events"] += t_us.size
+        self.counts["events"] += t_us.size
         if not t_us.size:
             return []
         if not (t_us.flags.carray and x.flags.carray and y.flags.carray and p.flags.carray):
@@ -140,7 +136,7 @@ class CameraClock:
         self._held = []
 
     def _count_dropped(self, name: str, first: int, number: int) -> None:
-        self._counts[name] += number
+        self.counts[name] += number
         self.firsts[name] = min(self.firsts.get(name, first), first)
 
     def _count_dropped_where(self, name: str, mask: NDArray[np.bool_], first: int) -> None:
@@ -162,7 +158,7 @@ class CameraClock:
             events = events[number:]
             if are_lost:
                 self._drop_held()
-            first = self._counts["events"] - len(events) - number
+            first = self.counts["events"] - len(events) - number
             for verdict, name in enumerate(_DROPPED):
                 self._count_dropped_where(name, verdicts == verdict, first)
             if (kept := verdicts == _KEPT).any():
@@ -185,7 +181,7 @@ class CameraClock:
             good = on_sensor & (some.t_us <= _FARTHEST_US) & (some.t_us >= -_FARTHEST_US)
             if good.any():
                 return int(some.t_us[int(good.argmax())])
-        first = self._counts["events"] - len(events)
+        first = self.counts["events"] - len(events)
         self._count_dropped_where("dropped_off_sensor", ~on_sensor, first)
         self._count_dropped_where("dropped_time_doubtful", on_sensor, first)
         return None
@@ -201,7 +197,7 @@ class CameraClock:
     def _confirm_held(self) -> Events:
         """Let the clock leap to the events that are held; return them in stream time."""
         before_us, first_us, last_us, _ = self._state.tolist()
-        self._counts["clock_leaps" if first_us > before_us else "clock_restarts"] += 1
+        self.counts["clock_leaps" if first_us > before_us else "clock_restarts"] += 1
         self._start_clock(first_us, self.last_us + _BREAK_US)
         self._state[0], self._state[3] = last_us, 0
         held, self._held = Events.concat(self._held), []

@@ -18,7 +18,6 @@ from evlcp_sdk.rx.regions import (
     RegionTrack,
     RegionTracker,
     TrackedRegion,
-    drop_oldest_events,
     is_same_place,
     memory_bytes,
 )
@@ -74,16 +73,15 @@ class DetectorTracker(RegionTracker):
             elif len(self.alive) < self._limits.regions:
                 pieces = deque((begun_us, _select_inside(before, place)) for begun_us, before in self._recent)
                 first_us = pieces[0][0] if pieces else start_us
-                end_us = start_us + self._step_us
-                self.alive.append(TrackedRegion(id, RegionTrack([place]), first_us, pieces, opened_us=end_us))
+                region = TrackedRegion(id, RegionTrack([place]), first_us, pieces)
+                region.opened_us = start_us + self._step_us
+                self.alive.append(region)
             else:
                 self.counts["regions_left_out"] += 1
         for region in self.alive:
             region.add(start_us, _select_inside(events, region.latest))
         self._store_step(start_us, events)
-        self.counts["dropped_no_room"] += drop_oldest_events(
-            self.alive, self._limits.region_bytes, self._step_us
-        )
+        self._limit_memory(self._limits.region_bytes, self._step_us)
         seen = list(self.alive)
         self.alive = [region for region in self.alive if not region.released]
         return seen

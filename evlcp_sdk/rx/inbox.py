@@ -1,7 +1,7 @@
 """Packets to messages: soft bits to blocks, blocks to messages, signatures to trust."""
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -163,7 +163,7 @@ class MessageAssembler:
         inbox = self._inboxes.setdefault(packet.transmitter, _Inbox())
         self._inboxes.move_to_end(packet.transmitter)
         while len(self._inboxes) > _MOST_TRANSMITTERS:
-            self._abandon(self._inboxes.popitem(last=False)[1])
+            self._count_missing(self._inboxes.popitem(last=False)[1].incomplete.values())
         self.counts["blocks_tried"] += 1
         content, packets = self._decode_packet(inbox, self._calibrate_llr(packet))
         if content is None:
@@ -184,7 +184,7 @@ class MessageAssembler:
     def close(self) -> None:
         """End the stream: parts of incomplete messages count as missing."""
         for inbox in self._inboxes.values():
-            self._abandon(inbox)
+            self._count_missing(inbox.incomplete.values())
         self._inboxes.clear()
 
     def _calibrate_llr(self, packet: Packet) -> NDArray[np.float32]:
@@ -233,13 +233,14 @@ class MessageAssembler:
             # Two messages under one number: the later one is collected anew.
             self.counts["parts_conflicting"] += 1
             inbox.complete.pop(key, None)
-            self._count_missing(inbox.incomplete.pop(key, None))
+            if key in inbox.incomplete:
+                self._count_missing([inbox.incomplete.pop(key)])
         total = total_bytes(block.length, self._room)
         partial = inbox.incomplete.setdefault(key, _PartialMessage(block.length, total))
         inbox.incomplete.move_to_end(key)
         partial.parts[block.index] = block.part
         while len(inbox.incomplete) > _MOST_MESSAGES:
-            self._count_missing(inbox.incomplete.popitem(last=False)[1])
+            self._count_missing([inbox.incomplete.popitem(last=False)[1]])
         if sum(map(len, partial.parts.values())) != partial.total:
             return []
         try:
@@ -303,13 +304,9 @@ class MessageAssembler:
             known.delivered = TrustVerdict("unverified", "undecodable")
             self.counts["messages_undecodable"] += 1
 
-    def _count_missing(self, partial: _PartialMessage | None) -> None:
-        if partial is not None:
+    def _count_missing(self, incomplete: Iterable[_PartialMessage]) -> None:
+        for partial in incomplete:
             self.counts["parts_missing"] += -(-partial.total // self._room) - len(partial.parts)
-
-    def _abandon(self, inbox: _Inbox) -> None:
-        for partial in inbox.incomplete.values():
-            self._count_missing(partial)
 
 
 def _agreement(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:

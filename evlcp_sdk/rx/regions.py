@@ -3,7 +3,8 @@
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, Final, NamedTuple
@@ -85,33 +86,23 @@ class RegionTrack:
     (2, (5.5, 7.0), (8.0, 7.0), (4.0, 9.0))
     """
 
-    def __init__(self, regions: Iterable[Region]) -> None:
-        regions = list(regions)
-        self.previous, self.latest = [regions[0], *regions][-2:]
-        self._first, self._end = 0, len(regions)
-        self._columns = np.empty((5, max(2 * len(regions), _CAPACITY)))
-        for sample, p in zip(self._columns.T, regions, strict=False):
-            sample[:] = p.t_us, p.x_px, p.y_px, p.width_px, p.height_px
+    def __init__(self, regions: Sequence[Region]) -> None:
+        self.previous = self.latest = regions[0]
+        self._first = self._end = 0
+        self._columns = np.empty((5, _CAPACITY))
+        for region in regions:
+            self.append(region)
 
     def __len__(self) -> int:
         return self._end - self._first
 
-    def __iter__(self) -> Iterator[Region]:
-        for row in self._samples().T.tolist():
-            yield make_region(self.latest.id, *row)
-
     def append(self, region: Region) -> None:
         """Add the next one."""
-        columns, end = self._columns, self._end
-        if end == columns.shape[1]:
-            samples = self._samples().copy()
-            end = samples.shape[1]
-            if 2 * end > columns.shape[1]:
-                self._columns = columns = np.empty((5, 2 * columns.shape[1]))
-            columns[:, :end] = samples
-            self._first = 0
-        columns[:, end] = region.t_us, region.x_px, region.y_px, region.width_px, region.height_px
-        self._end = end + 1
+        if self._end == self._columns.shape[1]:
+            self._reallocate()
+        sample = region.t_us, region.x_px, region.y_px, region.width_px, region.height_px
+        self._columns[:, self._end] = sample
+        self._end += 1
         self.previous, self.latest = self.latest, region
 
     def drop_latest(self) -> None:
@@ -149,27 +140,23 @@ class RegionTrack:
                 of the excess: the row within that which is nearest to `row_px` is taken.
             drift_us: Times from and to which the shift grows evenly from 0; samples before the first stay.
         """
-        other = object.__new__(RegionTrack)
-        samples = self._samples()
-        count = samples.shape[1]
-        other._columns = np.empty((5, max(2 * count, _CAPACITY)))
-        other._first, other._end = 0, count
-        shifted = other._samples()
-        shifted[:] = samples
+        track = copy(self)
+        track._reallocate()
+        samples = track._samples()
         share: NDArray[np.float64] | float = 1.0
         if drift_us is not None and drift_us[1] > drift_us[0]:
             share = (samples[0] - drift_us[0]) / (drift_us[1] - drift_us[0])
             share = np.minimum(np.maximum(share, 0.0), 1.0)
-        shifted[1] += share * right_px
-        shifted[2] += share * down_px
+        samples[1] += share * right_px
+        samples[2] += share * down_px
         if size_px is not None:
             if most_px < np.inf:
                 slack_px = np.maximum(np.abs(samples[4] - size_px[1]) - most_px, 0.0) / 2
-                shifted[2] += np.minimum(np.maximum(row_px - shifted[2], -slack_px), slack_px)
-            shifted[3], shifted[4] = size_px
-        other.latest = make_region(id, *shifted[:, -1].tolist())
-        other._find_previous()
-        return other
+                samples[2] += np.minimum(np.maximum(row_px - samples[2], -slack_px), slack_px)
+            samples[3], samples[4] = size_px
+        track.latest = make_region(id, *samples[:, -1].tolist())
+        track._find_previous()
+        return track
 
     def centres_at(
         self, times: NDArray[np.float64], start_us: float = 0.0, unit_us: float = 1.0
@@ -218,6 +205,14 @@ class RegionTrack:
     def _samples(self) -> NDArray[np.float64]:
         """Times, columns, rows, widths and heights, float64 (5, n)."""
         return self._columns[:, self._first : self._end]
+
+    def _reallocate(self) -> None:
+        """Copy the samples into an array with room for as many more."""
+        samples = self._samples()
+        count = samples.shape[1]
+        self._columns = np.empty((5, max(2 * count, _CAPACITY)))
+        self._columns[:, :count] = samples
+        self._first, self._end = 0, count
 
 
 def make_region(id: int, t_us: float, x_px: float, y_px: float, width_px: float, height_px: float) -> Region:
@@ -362,23 +357,6 @@ class TrackedRegion:
         self.track.forget_before(track_us)
 
 
-def drop_oldest_events(regions: Sequence[TrackedRegion], most_bytes: int, step_us: int) -> int:
-    """Drop the oldest events of regions until all take `most_bytes` at the most; return their number."""
-    spare, dropped = most_bytes - sum(region.memory_bytes for region in regions), 0
-    while spare < 0:
-        longer = [region for region in regions if len(region.pieces) > 1]
-        if not longer:
-            break
-        oldest_us = min(region.pieces[0][0] for region in longer)
-        for region in longer:
-            if spare < 0 and region.pieces[0][0] == oldest_us:
-                spare += region.memory_bytes
-                dropped += region.drop_oldest()
-                spare -= region.memory_bytes
-                region.forgotten_until_us = region.first_us = oldest_us + step_us
-    return dropped
-
-
 def is_same_place(one: Region, other: Region) -> bool:
     """Whether the centre of one of two regions lies in the other."""
     right, down = abs(one.x_px - other.x_px), abs(one.y_px - other.y_px)
@@ -419,6 +397,18 @@ class RegionTracker(ABC):
         """Stop tracking a region at once."""
         region.released = True
         self.alive = [other for other in self.alive if other is not region]
+
+    def _limit_memory(self, most_bytes: int, step_us: int) -> None:
+        """Drop the oldest events until those of all regions take `most_bytes` at the most."""
+        spare = most_bytes - sum(region.memory_bytes for region in self.alive)
+        while spare < 0 and (longer := [region for region in self.alive if len(region.pieces) > 1]):
+            oldest_us = min(region.pieces[0][0] for region in longer)
+            for region in longer:
+                if spare < 0 and region.pieces[0][0] == oldest_us:
+                    spare += region.memory_bytes
+                    self.counts["dropped_no_room"] += region.drop_oldest()
+                    spare -= region.memory_bytes
+                    region.forgotten_until_us = region.first_us = oldest_us + step_us
 
 
 _LEAST_RISES = 20
@@ -500,17 +490,15 @@ class RhythmTracker(RegionTracker):
         self._measure_us = round(_MEASURE_GAPS * gap_chips * chip_us)
         self._latency_us = _LATENCY_CHIPS * chip_us
         self._chip_us = chip_us
-        shape = (camera.height, camera.width)
         self._detector = detector or BlinkDetector(
             camera.width, camera.height, chip_us, spec.min_score, gap_chips
         )
         # Emptied once a step: two bytes each.
-        self._hits = np.zeros([(n - 1 >> CELL_SHIFT) + 1 for n in shape], np.int16)
+        self._hits = np.zeros([(n - 1 >> CELL_SHIFT) + 1 for n in (camera.height, camera.width)], np.int16)
         self._fresh: list[Box] = []
         self._sweeps: list[Sweep] = []
-        steps = math.ceil(min(keep_us, _MOST_RECENT_US) / spec.step_us)
         self._recent: deque[Piece] = deque()
-        self._most_recent = max(steps, BACKFILL_STEPS)
+        self._most_recent = max(math.ceil(min(keep_us, _MOST_RECENT_US) / spec.step_us), BACKFILL_STEPS)
         self._recent_bytes = 0
         self._next_id = 0
         self.alive: list[TrackedRegion] = []
@@ -535,7 +523,7 @@ class RhythmTracker(RegionTracker):
                 region.filter, place, region.velocity_px_us = found
                 region.track.append(place)
         self._merge_overlapping()
-        self._limit_memory()
+        self._limit_memory(self._limits.region_bytes, spec.step_us)
         self._open_regions(end_us, rises, occupied)
         if outside >= _LEAST_SWEEP_EVENTS and all(
             one.velocity_px_us != STILL or one.size_px is None for one in self.alive
@@ -547,22 +535,16 @@ class RhythmTracker(RegionTracker):
         self._drop_released()
         return seen
 
-    def _limit_memory(self) -> None:
-        self.counts["dropped_no_room"] += drop_oldest_events(
-            self.alive, self._limits.region_bytes, self._spec.step_us
-        )
-
     def _predict_boxes(self, t_us: float, occupied: Sequence[Region]) -> list[Box]:
         """The box of each region in the middle of a step; one of unknown size is kept clear of the others."""
         boxes, unknown, others = [], [], [box_of(place) for place in occupied]
         for region in self.alive:
-            last = region.latest
             x_px, y_px = self._predict_centre(region, t_us)
             boxes.append(self._search_box(x_px, y_px, *self._swept_size(region)))
             if region.size_px is None:
                 unknown.append(len(boxes) - 1)
             else:
-                others.append(box_around(x_px, y_px, last.width_px, last.height_px))
+                others.append(box_around(x_px, y_px, region.latest.width_px, region.latest.height_px))
         for number in unknown:
             boxes[number] = subtract_boxes(boxes[number], others)
         return boxes
@@ -590,7 +572,6 @@ class RhythmTracker(RegionTracker):
         ]
 
     def _drop_released(self) -> None:
-        """Stop tracking the regions that are released."""
         lost = [region for region in self.alive if region.released and region.size_px is not None]
         self.alive = [region for region in self.alive if not region.released]
         for region in self.alive:
@@ -638,7 +619,7 @@ class RhythmTracker(RegionTracker):
             box = self._search_box(x_px, y_px, *size_px)
             gathered[start] = self._detector.select(events, [box], [False])[0]
         region.replace_pieces(deque((start, gathered.get(start, events)) for start, events in region.pieces))
-        self._limit_memory()
+        self._limit_memory(self._limits.region_bytes, step_us)
 
     def correct_region(self, region: TrackedRegion, bar: BarPlace) -> float:
         """Fit a region to its bar as a frame showed it; return how far it was off, px.
@@ -720,9 +701,9 @@ class RhythmTracker(RegionTracker):
 
     def has_room(self) -> bool:
         """Whether another region may be tracked; counts one that may not."""
-        room = len(self.alive) < self._limits.regions
-        self.counts["regions_left_out"] += not room
-        return room
+        has_room = len(self.alive) < self._limits.regions
+        self.counts["regions_left_out"] += not has_room
+        return has_room
 
     def begin_partial_step(self, start_us: int, until_us: int, events: Events, ids: Collection[int]) -> None:
         """Give some regions the events of a time step so far, and their places by these.

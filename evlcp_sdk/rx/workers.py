@@ -79,7 +79,12 @@ class Workers:
                 ", as a sink or plugin follows the stages" if has_announcer and processes > 0 else " or more"
             )
             raise ConfigError(f"workers: {processes}, expected 1{why}")
-        shared = {name: link for name, link in links.items() if _has_bars(link)}
+        # Links whose bars have frames that can be decoded by themselves.
+        shared = {
+            name: link
+            for name, link in links.items()
+            if link.algorithm("framing").roles >= STEPS and link.algorithm("detection").rhythmic
+        }
         return cls(shared, processes - 1) if processes > 1 and shared else None
 
     def bar_decoders(self, link: str) -> list["_WorkerBarDecoder"]:
@@ -93,11 +98,6 @@ class Workers:
         """End the processes."""
         for worker in self._workers:
             worker.close()
-
-
-def _has_bars(link: Link) -> bool:
-    """Whether a link has frames of bars that can be decoded by themselves."""
-    return link.algorithm("framing").roles >= STEPS and link.algorithm("detection").rhythmic
 
 
 class _Worker:

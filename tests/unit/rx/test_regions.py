@@ -204,9 +204,8 @@ def test_a_region_does_not_go_on_to_the_bar_below():
             t_us = own.latest.t_us
             regions.correct_region(own, BarPlace(t_us, CENTRE, SIZE))
             other = regions.open_duplicate(own, t_us, below, SIZE)
-            own.track = RegionTrack(
-                replace(p, y_px=p.y_px + 7 * k) for k, p in enumerate(own.track, 1 - len(own.track))
-            )
+            before = own.track.previous
+            own.track = RegionTrack([replace(before, y_px=before.y_px - 7), own.latest])
         elif start > 10_000:
             assert own.latest.y_px == pytest.approx(CENTRE[1], abs=1)
             assert other.latest.y_px == pytest.approx(below[1], abs=1)
