@@ -98,7 +98,6 @@ def _hex_pieces(path: Path, data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _elf_pieces(path: Path, data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Segments at their load addresses."""
     try:
         if data[4:6] != b"\x01\x01":
             raise InputError(f"{path}: an ELF file, but not one of 32 bits, little-endian")

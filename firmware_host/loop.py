@@ -194,7 +194,6 @@ def run_loop(
 
 
 def _message_step(text: str, message: Message, symbols: NDArray[np.int64], link: Link, folder: Path) -> Step:
-    """Write the link and the symbols."""
     packet = link.packet
     with Outputs() as outputs:
         outputs.write_text(to_toml(link, Registry.load()), folder / "link.toml")
@@ -226,7 +225,6 @@ def _count_text(count: int, of: str) -> str:
 
 
 def _light_step(light: EmulatedLight, link: Link, folder: Path) -> Step:
-    """Write the LED record and the chips."""
     with Outputs() as outputs:
         outputs.open_binary(folder / "leds.bin").write(light.record.to_bytes())
         outputs.write_array(light.chips, folder / _CHIPS)
@@ -244,7 +242,6 @@ def _light_step(light: EmulatedLight, link: Link, folder: Path) -> Step:
 def _make_scene(
     light: EmulatedLight, link: Link, chips_file: Path, distance_m: float, in_view: int, seed: int
 ) -> dict[str, Any]:
-    """A scene in which a still camera sees the light for so many packets."""
     start_chip = float(np.random.default_rng([seed, 1]).uniform(0, link.packet.packet_chips))
     bar = {
         "x_m": 0.0,
@@ -272,7 +269,6 @@ def _scene_step(
     seed: int,
     progress: Callable[[float], None],
 ) -> Step:
-    """Render the scene, and add the symbols to its truth."""
     raw, duration_s = folder / RECORDING, scene["duration_s"]
     simulated = simulate(scene, seed)
     _, truth_file = simulated.save(raw, lambda done_s: progress(done_s / duration_s))
@@ -288,7 +284,6 @@ def _scene_step(
 
 
 def _receiver_step(link: Link, folder: Path, decoded: "_DecodedTexts", sinks: Sequence[str]) -> Step:
-    """Receive the recording, and compare it with its truth."""
     raw = folder / RECORDING
     summary = receive_to_folder(raw, folder / RECEIVED, link, registry=Registry.load(decoded), sinks=sinks)
     counts, transmitters = summary["counts"], summary["transmitters"]
@@ -312,7 +307,6 @@ def _receiver_step(link: Link, folder: Path, decoded: "_DecodedTexts", sinks: Se
 
 
 def _describe_frames(figures: dict[str, Any]) -> str:
-    """The received frames as text."""
     frames, sent, errors, bits = (figures[key] for key in ("frames", "frames_sent", "bit_errors", "bits"))
     if not frames:
         return f"{figures['result']}; {sent} frames were sent"

@@ -136,11 +136,7 @@ class Block:
 
     @classmethod
     def unpack(cls, block: bytes, kinds: Collection[int] = _KINDS) -> "Block":
-        """A block from its bytes.
-
-        Args:
-            block: The bytes.
-            kinds: Numbers of the known kinds.
+        """A block from its bytes; `kinds` are the numbers of the known kinds.
 
         Raises:
             BlockError: The version or kind is unknown, no message of that length has such a part, or bytes
@@ -189,11 +185,7 @@ def _whiten(head: bytes, body: bytes) -> bytes:
 
 
 def total_bytes(length: int, room: int) -> int:
-    """Bytes of a message's parts together: its own, with a CRC if it does not fit into one part.
-
-    Args:
-        length: Bytes of the message.
-        room: Bytes of a part.
+    """Bytes of all parts, of `room` bytes each, of a message: with a CRC if it does not fit into one.
 
     >>> total_bytes(40, 40), total_bytes(41, 40)
     (40, 45)
@@ -202,15 +194,10 @@ def total_bytes(length: int, room: int) -> int:
 
 
 def split_message(message: Message, codebook: bytes, size: int) -> Iterator[Block]:
-    """The blocks of a message, of `size` bytes each.
+    """The blocks of a message, of `size` bytes each, with the digest of a codebook (`DIGEST_BYTES` bytes).
 
     A message of several blocks is followed by its CRC-32 (that of zlib): each block has its own check, but
     parts of two messages with one number would pass for one message.
-
-    Args:
-        message: The message.
-        codebook: First `DIGEST_BYTES` bytes of the codebook's digest.
-        size: Bytes of a block.
 
     Raises:
         ConfigError: There are more parts than a header can number.
@@ -235,11 +222,7 @@ def split_message(message: Message, codebook: bytes, size: int) -> Iterator[Bloc
 
 
 def join_parts(parts: Sequence[bytes], length: int) -> bytes:
-    """The payload of a message from all its parts, in order.
-
-    Args:
-        parts: The parts of its blocks.
-        length: Bytes of the message.
+    """The payload of a message of `length` bytes from all its parts, in order.
 
     Raises:
         BlockError: The parts are not those of one message.

@@ -119,12 +119,7 @@ def _check_symbols(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.int64]:
 
 
 def packet_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -> NDArray[np.uint8]:
-    """Chips of one packet: symbols (F, K) to uint8 (chips, K), 1 = on.
-
-    Args:
-        symbols: The packet's symbols.
-        codebook: The codes.
-        pilot_every: Frames from one pilot to the next.
+    """Chips of one packet, uint8 (chips, K), 1 = on, from its symbols (F, K).
 
     Raises:
         ConfigError: The symbols have another shape, or are not in the codebook.

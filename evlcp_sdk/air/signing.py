@@ -85,22 +85,14 @@ def public_key(key: "Ed25519PrivateKey") -> str:
 
 
 def signature_input(beacon: Message, codebook: bytes) -> bytes:
-    """The bytes that a beacon's signature covers: all content of its blocks.
-
-    Args:
-        beacon: The beacon.
-        codebook: First `DIGEST_BYTES` bytes of the codebook's digest.
-    """
+    """The bytes that a beacon's signature covers, with the first `DIGEST_BYTES` of the codebook's digest."""
     return _DOMAIN + _SIGNED_HEAD.pack(beacon.transmitter_id, beacon.sequence, codebook) + beacon.payload
 
 
 def sign(beacon: Message, codebook: bytes, key: "Ed25519PrivateKey") -> Message:
-    """The signature of a beacon, a message with the beacon's own transmitter and sequence.
+    """The signature of a beacon, a message with its transmitter and sequence, by the operator's private key.
 
-    Args:
-        beacon: The beacon.
-        codebook: First `DIGEST_BYTES` bytes of the codebook's digest.
-        key: The operator's private key.
+    `codebook` are the first `DIGEST_BYTES` bytes of the codebook's digest.
     """
     name = _key_name(key.public_key().public_bytes_raw())
     payload = name + key.sign(signature_input(beacon, codebook))
@@ -233,12 +225,9 @@ class TrustedKeys:
         return self._grants.get(signature.payload[:KEY_NAME_BYTES], ())
 
     def verify(self, beacon: Message, codebook: bytes, signature: Message) -> bool | None:
-        """Whether a beacon's signature is correct; None if it names no known key.
+        """Whether the signature that came with a beacon is correct; None if it names no known key.
 
-        Args:
-            beacon: The beacon.
-            codebook: First `DIGEST_BYTES` bytes of the codebook's digest.
-            signature: The message of kind SIGNATURE that came with it.
+        `codebook` are the first `DIGEST_BYTES` bytes of the codebook's digest.
         """
         name, value = signature.payload[:KEY_NAME_BYTES], signature.payload[KEY_NAME_BYTES:]
         key = self._keys.get(name)

@@ -88,9 +88,8 @@ class BlockCoder:
     def decode_block(self, llr: NDArray[np.float32]) -> bytes | None:
         """The block of a packet; None if the code's check fails.
 
-        Args:
-            llr: LLRs ln P(bit 0) / P(bit 1) of the packet's bits in the order on air, float32 (bits,); 0 for
-                a bit that was not received.
+        `llr` are the LLRs ln P(bit 0) / P(bit 1) of its bits in the order on air, float32 (bits,); 0 for a
+        bit that was not received.
         """
         # Fewer bits than the message has cannot determine it.
         if np.count_nonzero(llr) < self._code.message_bits:

@@ -119,13 +119,7 @@ def encode_utf8(text: str, name: str) -> bytes:
 
 
 def encode_messages(messages: Iterable[Message], coder: BlockCoder, repeat: int = 1) -> NDArray[np.int64]:
-    """Symbols of the packets with messages, one after another, int64 (packets, frames, clusters).
-
-    Args:
-        messages: The messages, in the order in which they are sent.
-        coder: Encodes their blocks.
-        repeat: Times in a row that each packet is sent.
-    """
+    """Symbols of the packets with messages, each sent `repeat` times, int64 (packets, frames, clusters)."""
     return np.stack(list(iterate_packets(messages, coder, repeat)))
 
 

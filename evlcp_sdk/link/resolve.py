@@ -280,12 +280,6 @@ _SECTIONS = [*_SPECS, *ROLES]
 class _Resolver:
     """Checks the tables of a link one by one, and collects their faults.
 
-    Args:
-        table: Section to keys.
-        registry: The algorithms.
-        source: Name of the table in errors; empty for none.
-        overridden: Each (section, key) that came from `--set`.
-
     Attributes:
         faults: The faults found.
         built: The object that each section describes.
@@ -376,7 +370,6 @@ class _Resolver:
             return {"id": name} | asdict(self.built[section])
 
     def _default_id(self, role: str) -> str:
-        """Id of a role's algorithm that the table does not name."""
         framing = self.built.get("framing")
         if role == "detection" and framing is not None and framing.detection:
             return str(framing.detection)
@@ -396,12 +389,7 @@ class _Resolver:
 
 
 def load_led_file(table: Mapping[str, Any], folder: Path = Path(), prefix: str = "") -> dict[str, Any]:
-    """A copy of a link's table with the LEDs of the CSV file that its `[bar]` names.
-
-    Args:
-        table: As read from TOML.
-        folder: Folder of the file.
-        prefix: Beginning of an error's text.
+    """A copy of a link's table with the LEDs of the CSV file, in a folder, that its `[bar]` names.
 
     Raises:
         ConfigError: The file cannot be read or does not describe LEDs, or the table has LEDs, too.

@@ -88,10 +88,7 @@ def name_links(link: Link | Sequence[Link]) -> dict[str, Link]:
 
 
 def select_positioning_links(links: Mapping[str, Link]) -> dict[str, Link]:
-    """The links with bars for positions: the only one, or those of more than one cluster.
-
-    Args:
-        links: As `name_links` gives them.
+    """The links, by name, with bars for positions: the only one, or those of more than one cluster.
 
     Raises:
         ConfigError: None of several links has such bars, or these differ in `[position]`.
@@ -112,13 +109,10 @@ def select_positioning_links(links: Mapping[str, Link]) -> dict[str, Link]:
 
 
 def find_ambiguous_links(links: Mapping[str, Link]) -> list[tuple[str, str]]:
-    """Pairs of links of which one may decode what the other sends, so that rows may name the wrong one.
+    """Pairs of links, by name, of which one may decode what the other sends, so that rows may be of either.
 
     Their LEDs rest while nothing is sent, their rates differ by no more than `Framing.clock_share`, and each
     codeword of one, without its longer rest, is a codeword of the other.
-
-    Args:
-        links: As `name_links` gives them.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> one_led = ["bar.rows=1", "bar.columns=1", "bar.cluster_rows=1", "bar.cluster_columns=1"]
@@ -156,7 +150,6 @@ def _is_contained(words: NDArray[np.bool_], others: NDArray[np.bool_]) -> bool:
 
 
 def _check_pair(name: str, one: Link, other_name: str, other: Link) -> None:
-    """Raise ConfigError if two links cannot be received together."""
     both = f"'{name}' and '{other_name}'"
     for section in ("camera", "camera_sigma"):
         if getattr(one, section) != getattr(other, section):

@@ -51,12 +51,7 @@ def find_sinks(registry: Registry) -> dict[str, InstalledSink]:
 
 
 def choose_sinks(registry: Registry, names: Sequence[str], *, positions: bool) -> list[InstalledSink]:
-    """The output formats of a run: the default ones and those requested.
-
-    Args:
-        registry: The plugins.
-        names: The requested formats.
-        positions: Whether positions are computed.
+    """The output formats of a run with or without positions: the default ones and those requested by name.
 
     Raises:
         ConfigError: There is no such format, or it needs positions and none are computed.

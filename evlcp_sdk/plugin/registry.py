@@ -125,14 +125,9 @@ class Registry:
         return [impl.plugin_name for impl in getattr(self.hook, hook).get_hookimpls()]
 
     def call_hook(self, hook: str, *, only: str | None = None, **arguments: Any) -> list[tuple[str, Any]]:
-        """Call a hook of every plugin; return pairs of its name and answer, an iterator's as a list.
+        """Call a hook of every plugin, or of `only` one; return pairs of its name and answer.
 
-        A plugin that fails is left out from then on, with all its hooks.
-
-        Args:
-            hook: Name of the hook.
-            only: Name of the only plugin to call; None for all.
-            arguments: The hook's arguments.
+        An iterator's answer is a list. A plugin that fails is left out from then on, with all its hooks.
         """
         answers = []
         for impl in list(getattr(self.hook, hook).get_hookimpls()):
@@ -195,12 +190,7 @@ class Registry:
                 self._owners.pop(name, None)
 
     def leave_out(self, plugin: str, reason: str) -> None:
-        """Leave out a plugin whose answer to a hook cannot be used.
-
-        Args:
-            plugin: Its name, as from `call_hook`.
-            reason: Its fault, in one line.
-        """
+        """Leave out a plugin, by its name, whose answer to a hook is of no use, for a reason in one line."""
         self._record_broken(plugin, reason, _algorithms_of(self._manager.unregister(name=plugin)))
 
     def list_algorithms(self, role: str | None = None) -> list[InstalledAlgorithm]:
@@ -252,7 +242,6 @@ class Registry:
         return (plugin, "-") if found is None else _name_and_version(found)
 
     def _add_plugin(self, plugin: object) -> str:
-        """Register an object with hooks; return the name that it gets."""
         kind = getattr(plugin, "__name__", type(plugin).__name__)
         name = f"{kind}-{id(plugin):x}"
         if (fault := self._register(plugin, name, None)) is not None:
@@ -341,13 +330,11 @@ def import_class(who: str, target: str, kind: type[Any] = object) -> type[Any]:
 
 
 def _describe_fault(fault: BaseException) -> str:
-    """An exception in one line."""
     text = " ".join(str(fault).split())
     return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
 
 
 def _algorithm_fault(record: Algorithm, _others: object) -> str | None:
-    """The fault of a plugin's algorithm, if any."""
     if record.role in ROLES:
         return None
     return f"algorithm '{record.id}' has role '{record.role}', expected one of {', '.join(ROLES)}"

@@ -184,7 +184,6 @@ class EventSource(ABC):
             yield events, triggers
 
     def _take_checked(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """The piece from `take`, checked, as kernels rely on it."""
         with self._wrap_faults():
             piece: object = self.take(max_events)
         if piece is None:
@@ -215,22 +214,13 @@ class EventSource(ABC):
         return PluginError(f"{self.path}: source {type(self).__name__}: {what}")
 
     def chunks(self, max_events: int = DEFAULT_MAX_EVENTS) -> Iterator[Events]:
-        """Yield the events of `stream`; its triggers only count in `counts`.
-
-        Raises:
-            InputError: The file cannot be read on.
-            StreamError: `max_events` is not positive.
-        """
+        """Yield the events of `stream`; its triggers only count in `counts`. Errors are those of `stream`."""
         for events, _ in self.stream(max_events):
             if len(events):
                 yield events
 
     def read(self) -> tuple[Events, Triggers]:
-        """Return all following events and triggers at once.
-
-        Raises:
-            InputError: The file cannot be read on.
-        """
+        """Return all following events and triggers at once; errors are those of `stream`."""
         pieces = list(self.stream(1 << 20))
         return Events.concat(e for e, _ in pieces), Triggers.concat(g for _, g in pieces)
 

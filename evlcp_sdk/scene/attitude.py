@@ -202,7 +202,6 @@ class AttitudeLog:
         return log
 
     def _check_conventions(self, path: Path | str) -> None:
-        """Raise ConfigError if forces or rates have the wrong sign or scale."""
         if self._acceleration_m_s2 is not None:
             upward = float(self._acceleration_m_s2[:, 2].mean()) + _GRAVITY_M_S2
             if not 0.5 * _GRAVITY_M_S2 < upward < 1.5 * _GRAVITY_M_S2:
@@ -334,7 +333,6 @@ class AttitudeLog:
         return np.stack([level * np.sin(roll), level * np.cos(roll), np.sin(pitch)], 1)
 
     def _rate_deg_s(self, t_us: float) -> tuple[float, float, float]:
-        """Rates of pitch, roll and heading between the two lines around a time."""
         after = min(max(int(np.searchsorted(self.t_us, t_us, "right")), 1), len(self.t_us) - 1)
         dt_s = float(self.t_us[after] - self.t_us[after - 1]) * 1e-6
 

@@ -68,11 +68,7 @@ class CameraModel:
         return self.width / 2 if x is None else x, self.height / 2 if y is None else y
 
     def project(self, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixel positions (column, row) of points in camera axes; NaN for points that are not in front.
-
-        Args:
-            points_m: x right, y down, z forward, m, float64 (..., 3).
-        """
+        """Pixel positions of points in camera axes, m, float64 (..., 3); NaN for points not in front."""
         z = points_m[..., 2:]
         return self.distort(points_m[..., :2] / np.where(z > 0, z, np.nan))
 
@@ -117,9 +113,7 @@ class CameraModel:
     ) -> NDArray[np.float64]:
         """Derivatives of `distort` by `CAMERA_PARAMETERS`, the focal length in px: float64 (..., 2, 7).
 
-        Args:
-            direction: float64 (..., 2).
-            seen_px: `distort(direction)`, if the caller has it already.
+        `seen_px` is `distort(direction)`, if the caller has it already.
         """
         seen_px = self.distort(direction) if seen_px is None else seen_px
         u, v, f = direction[..., 0], direction[..., 1], self.focal_px
@@ -134,13 +128,10 @@ class CameraModel:
         return slope
 
     def undistort(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Directions (x / z, y / z) of pixel positions (column, row): the inverse of `distort`.
+        """Directions (x / z, y / z) of pixel positions, float64 (..., 2) both: the inverse of `distort`.
 
         Newton steps from the undistorted direction; NaN where they do not converge, as for a pixel beyond the
         largest angle that a strong distortion can show.
-
-        Args:
-            points_px: float64 (..., 2).
         """
         undistorted = (points_px - self.centre_px) / self.focal_px
         if self.is_pinhole:
@@ -178,9 +169,7 @@ class CameraModel:
     def distance_m(self, spacing_m: float, spacing_px: float) -> float:
         """Depth of two points parallel to the sensor, m: L = f S / (l' a) of arXiv 2510.17203.
 
-        Args:
-            spacing_m: Their distance S from each other, m.
-            spacing_px: Their distance in the image, l', px.
+        S is their distance `spacing_m`, and l' their distance in the image, `spacing_px`.
         """
         return self.focal_px * spacing_m / spacing_px
 

@@ -57,11 +57,9 @@ class Blur:
 
 
 def airy_blur(unit_px: float, gaussian_px: float) -> Blur:
-    """The Airy pattern of a round aperture, blurred by a Gaussian.
+    """The Airy pattern of a round aperture, blurred by a Gaussian of sigma `gaussian_px`.
 
-    Args:
-        unit_px: Wavelength times f-number, px.
-        gaussian_px: Sigma of the Gaussian, px.
+    `unit_px` is the wavelength times the f-number, px.
     """
     sigma, share = _airy_gaussians(unit_px)
     return Blur(np.hypot(sigma * unit_px, gaussian_px), share)

@@ -96,12 +96,7 @@ class BarSite:
         return np.array([level * math.sin(heading), level * math.cos(heading), math.cos(tilt)])
 
     def cluster_positions_m(self, clusters: int, axes: "LocalAxes") -> NDArray[np.float64]:
-        """Centres of its clusters in local axes, from its top, m, float64 (clusters, 3).
-
-        Args:
-            clusters: Number of equal parts of the bar.
-            axes: The local axes.
-        """
+        """Centres of the equal parts of the bar in local axes, from its top, m, float64 (clusters, 3)."""
         along = (0.5 - (np.arange(clusters) + 0.5) / clusters) * self.length_m
         return self._to_local_axes(along[:, None] * self.axis_enu(), axes)
 
@@ -273,14 +268,8 @@ def site_of_transmitter(
 ) -> BarSite | None:
     """The site of a received transmitter; None if it is unknown.
 
-    The id in its beacon decides, without one a site's `transmitter`. The only transmitter received is at the
-    only site.
-
-    Args:
-        sites: The known bars.
-        transmitter: Number that the receiver gave it.
-        transmitter_id: The id in its beacon; None before the first.
-        is_only: Whether it is the only transmitter received.
+    The id in its beacon decides, before the first one a site's `transmitter`. The only transmitter received
+    is at the only site.
     """
     if transmitter_id is not None:
         return next((s for s in sites if s.transmitter_id == transmitter_id), None)

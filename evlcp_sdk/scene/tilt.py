@@ -93,9 +93,7 @@ def line_of_sight(
 def magnification_of(camera: CameraModel, points_px: Floats) -> float:
     """Apparent size of a layout of clusters, as a multiple of that without the lens's distortion.
 
-    Args:
-        camera: The camera.
-        points_px: The clusters' centres in the image, px, float64 (K, 2); NaN where unseen.
+    `points_px` are the clusters' centres in the image, px, float64 (K, 2); NaN where unseen.
     """
     seen = points_px[np.isfinite(points_px).all(1)]
     if camera.is_pinhole or len(seen) < 2:

@@ -119,10 +119,7 @@ class Board:
     def start(self, at_pulse: int = 0, pulse_hz: int = 1, at_clock: int = 0) -> None:
         """Play the active bank: now, at a pulse and from then on in step with the pulses, or at a clock.
 
-        Args:
-            at_pulse: The pulse, as STATUS counts them; 0: none.
-            pulse_hz: Pulses a second.
-            at_clock: The clock, as in STATUS; 0: none.
+        Pulse and clock count as in STATUS; 0 is none.
         """
         self.session.call(protocol.StartRequest(at_pulse, pulse_hz if at_pulse else 0, at_clock))
 
@@ -391,7 +388,6 @@ class Board:
         return stream
 
     def _check_rate(self, content: Bank, status: protocol.StatusReply) -> None:
-        """Raise RefusedError if the board plays at another chip rate."""
         rate_hz = content.chip_rate_hz * self._hold_count(content)
         runs = status.state in (State.PLAYING, State.STOPPING, State.IDLE_PATTERN)
         if runs and status.chip_rate_hz != rate_hz:
@@ -536,7 +532,6 @@ class Board:
         return sorted(missing)
 
     def _wait_until_swapped(self) -> protocol.StatusReply:
-        """Status when no bank is pending any more."""
         status = self.session.wait_for_status(lambda status: status.pending_bank == NO_BANK, 10.0, 0.002)
         if status.pending_bank != NO_BANK:
             raise VerifyError(
@@ -546,12 +541,7 @@ class Board:
         return status
 
     def wait_with_keep_alive(self, seconds: float, status: protocol.StatusReply) -> None:
-        """Wait, with requests often enough that the board's watchdog does not act.
-
-        Args:
-            seconds: Duration, s.
-            status: The board's last status, with its watchdog.
-        """
+        """Wait, with requests often enough for the watchdog in the board's last status not to act."""
         line = self.session.transport
         end = line.time_s() + seconds
         acts = status.watchdog != Watchdog.KEEP

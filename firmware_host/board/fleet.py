@@ -102,8 +102,6 @@ class Entry:
 
 @dataclass(frozen=True)
 class _Tables:
-    """The tables of an inventory file."""
-
     board: Annotated[list[dict[str, Any]], Field(min_length=1)]
     defaults: dict[str, Any] = field(default_factory=dict)
 
@@ -188,7 +186,6 @@ def _load_bank(path: Path, index: int, entry: Entry, registry: Registry) -> Bank
 
 
 def _message_bank(folder: Path, entry: Entry, link: Link) -> Bank:
-    """The bank of a board's message."""
     site = None
     if entry.beacon is not None:
         site = choose_site(folder / entry.beacon, entry.transmitter_id, "transmitter_id")

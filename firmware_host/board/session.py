@@ -235,7 +235,6 @@ class Session:
         return status
 
     def _check_supported(self, request: WireRequest[Any]) -> None:
-        """Raise IncompatibleError if the board's protocol is too old for a request."""
         part = request.find_unsupported(self.client.minor)
         if part is None:
             return

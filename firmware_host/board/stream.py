@@ -27,8 +27,6 @@ _DARK_S = 10.0
 
 @dataclass(frozen=True, order=True)
 class _Piece:
-    """A piece of a packet."""
-
     number: int
     offset: int
     data: bytes = field(compare=False)
@@ -46,7 +44,7 @@ class Stream:
     `send` adds a packet; the board plays it after the earlier ones, and shows its idle pattern while the
     queue is empty. If the link's framing determines the LEDs' state meanwhile, pauses of that state keep the
     queue from being empty. As a context manager it ends in the dark: after the last packet, or, if something
-    was raised, after the playing one.
+    was raised, after the playing one. Its methods raise a `BoardError` if the line or the board fails.
 
     Args:
         session: The session with the board; nothing else may use it meanwhile.
@@ -61,17 +59,9 @@ class Stream:
         pauses: Pauses added, in packets.
         begun: Packets that have begun to play, pauses included, by the last reply.
         underruns: Times that the queue was empty, by the last reply.
-        requests: Requests sent, repeated ones included.
     """
 
-    def __init__(
-        self,
-        session: Session,
-        bank: int,
-        template: Bank,
-        ahead: int,
-        pulse_s: float,
-    ) -> None:
+    def __init__(self, session: Session, bank: int, template: Bank, ahead: int, pulse_s: float) -> None:
         self._session = session
         self._bank = bank
         self._template = template
@@ -137,9 +127,6 @@ class Stream:
                 `delay_s`, or None to end; an iterator that encodes each on demand avoids delays.
             every_s: Time between two messages, s; one whose packets take longer is sent once.
             stopped: Asked before each packet whether to end early.
-
-        Raises:
-            BoardError: The line or the board fails.
         """
         line = self._session.transport
         due_s, number = line.time_s(), 0
@@ -162,7 +149,6 @@ class Stream:
 
         Raises:
             ConfigError: The symbols are not a packet of the link.
-            BoardError: The line or the board fails.
         """
         packet, template = np.asarray(symbols), self._template
         shape = (template.packet.frames, template.clusters)
@@ -178,11 +164,9 @@ class Stream:
 
     @property
     def _next_number(self) -> int:
-        """Number of the next packet in the queue."""
         return self.sent + self.pauses
 
     def _queue_packet(self, content: bytes) -> int:
-        """Queue a packet to be sent; return its number in the queue."""
         number = self._next_number
         for at in range(0, len(content), self._piece_bytes):
             data = content[at : at + self._piece_bytes]
@@ -190,22 +174,14 @@ class Stream:
         return number
 
     def wait(self, seconds: float) -> None:
-        """Wait, with requests often enough that the board's watchdog does not act.
-
-        Raises:
-            BoardError: The line or the board fails.
-        """
+        """Wait, with requests often enough that the board's watchdog does not act."""
         end = self._session.transport.time_s() + seconds
         while (left := end - self._session.transport.time_s()) > 0.0:
             self._exchange(min(left, self._pulse_s))
             self._request_position()
 
     def close(self) -> None:
-        """Play all sent packets to their end, then go dark.
-
-        Raises:
-            BoardError: The line or the board fails.
-        """
+        """Play all sent packets to their end, then go dark."""
         self._pause_packet = None
         while self._pieces or self._in_flight:
             self._exchange(self._pulse_s)

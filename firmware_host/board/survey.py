@@ -26,16 +26,10 @@ class SurveyedPort:
 def survey_ports(
     baud: int, ports: list[SerialPort] | None = None, usb: UsbFilter | None = None, every: bool = False
 ) -> list[SurveyedPort]:
-    """List serial ports, and send HELLO to those that may have a board, all at once.
+    """List serial ports, all or with a USB id, and send HELLO at once to those that may have a board.
 
-    Nothing is written to a port unless its USB id is that of a bridge that boards usually have, as any other
-    device may be there.
-
-    Args:
-        baud: Line rate, bit/s.
-        ports: The ports; by default all of this machine.
-        usb: List only ports with this USB id, and send to all of them.
-        every: Send to all listed ports.
+    Nothing is written to a port unless its USB id is given, or that of a bridge that boards usually have, as
+    any other device may be there; `every` sends to all listed ports.
     """
     listed = [p for p in (serial_ports() if ports is None else ports) if usb is None or usb.matches(p)]
     if not listed:

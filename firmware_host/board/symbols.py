@@ -27,12 +27,9 @@ Symbols = NDArray[np.int64]
 
 
 def symbols_table(symbols: Symbols, link: Link, *, messages: bool = False) -> dict[str, Any]:
-    """The content of a file of symbols, plain values.
+    """The content of a file of symbols (packets, frames, clusters), plain values.
 
-    Args:
-        symbols: Symbols, int64 (packets, frames, clusters).
-        link: Their link.
-        messages: Whether they carry messages, so that the error correction counts.
+    With `messages` the error correction belongs to the link.
     """
     tables = (*ON_AIR, _CORRECTION) if messages else ON_AIR
     return {
@@ -45,10 +42,7 @@ def symbols_table(symbols: Symbols, link: Link, *, messages: bool = False) -> di
 def read_symbols(path: Path, link: Link | None, registry: Registry | None = None) -> tuple[Symbols, Link]:
     """Symbols of a file, int64 (packets, frames, clusters), and their link.
 
-    Args:
-        path: The file.
-        link: The user's link; None for the file's own, or all defaults if it has none.
-        registry: The algorithms; None for all that are installed.
+    The link is the user's, if there is one, else the file's own, or all defaults.
 
     Raises:
         IncompatibleError: The file was made with another link, or with other codes than those of its link.

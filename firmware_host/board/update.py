@@ -122,15 +122,8 @@ def update_firmware(
 ) -> UpdateResult:
     """Write another firmware to a dark board, restart it, and keep the firmware once it answers.
 
-    Until then it is on trial: at the third reset the board goes back to the previous one, which any failure
-    leaves intact.
-
-    Args:
-        board: The board; its session is opened anew.
-        package: The firmware.
-        progress: Called with bytes done and bytes in all.
-        keep: Whether to end the trial.
-        wait_s: Longest time for the restart, s.
+    Until then, and without `keep`, it is on trial: at the third reset the board goes back to the previous
+    one, which any failure leaves intact. `wait_s` is the longest time for the restart.
 
     Raises:
         IncompatibleError: The firmware is for another board.

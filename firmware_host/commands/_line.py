@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -123,12 +124,10 @@ def from_command_line(context: Any, name: str) -> bool:
     return getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE"
 
 
-@contextlib.contextmanager
-def open_board(context: typer.Context) -> "Iterator[Board]":
+def open_board(context: typer.Context) -> "AbstractContextManager[Board]":
     """Open the board that a command's options select."""
     line: BoardLine = context.obj
-    with line.open() as board:
-        yield board
+    return line.open()
 
 
 def print_watchdog(action: str, timeout_ms: int) -> None:
@@ -142,8 +141,7 @@ def print_watchdog(action: str, timeout_ms: int) -> None:
 
 
 KeepAlive = Annotated[
-    bool,
-    typer.Option("--keep-alive", help="Stay, for the board's watchdog, until Ctrl-C."),
+    bool, typer.Option("--keep-alive", help="Stay, for the board's watchdog, until Ctrl-C.")
 ]
 
 

@@ -22,8 +22,7 @@ class SymbolOptions:
     """Symbols and their link."""
 
     symbols: Annotated[
-        Path | None,
-        typer.Argument(metavar="SYMBOLS.json", help="Symbols and their link."),
+        Path | None, typer.Argument(metavar="SYMBOLS.json", help="Symbols and their link.")
     ] = None
     random: Annotated[
         int | None, typer.Option("--random", metavar="N", help="N packets of random symbols.")
@@ -65,19 +64,10 @@ class SymbolOptions:
 class BankOptions(SymbolOptions):
     """A board's payload: symbols, or chips."""
 
-    masks: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.npy", help="Chips instead of symbols."),
-    ] = None
+    masks: Annotated[Path | None, typer.Option(metavar="FILE.npy", help="Chips instead of symbols.")] = None
 
     def load_bank(self) -> "Bank":
-        """Load the bank.
-
-        Raises:
-            ConfigError: Not exactly one of them is given, the link is wrong, or a board cannot play it.
-            IncompatibleError: The file was made with another link.
-            InputError: A file is wrong.
-        """
+        """Load the bank; errors as of `load`, or a board cannot play it."""
         from evlcp_sdk.link.resolve import load_link
         from firmware_host.board.bank import make_bank, read_masks
 

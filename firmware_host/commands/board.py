@@ -122,10 +122,7 @@ def ports(
 
 
 @app.command(cls=LineCommand)
-def hello(
-    context: typer.Context,
-    as_json: AsJson = False,
-) -> None:
+def hello(context: typer.Context, as_json: AsJson = False) -> None:
     """Show what a board is and what it can.
 
     For example: [bold]evlcp board --port native: hello[/]
@@ -193,7 +190,6 @@ def program(
 
 
 def _check_inventory_options(context: typer.Context, *allowed: str) -> None:
-    """Raise ConfigError if an option is given that belongs into the inventory."""
     from evlcp_sdk.errors import ConfigError
 
     given = [
@@ -212,7 +208,6 @@ def _check_inventory_options(context: typer.Context, *allowed: str) -> None:
 
 
 def _make_reporter(as_json: bool) -> Callable[[str, dict[str, Any]], None]:
-    """A function that prints the result of each board of an inventory."""
     return lambda text, table: print_result(text, table, as_json)
 
 
@@ -329,7 +324,6 @@ def blank(context: typer.Context, inventory: InventoryFile = None, as_json: AsJs
 def _start_together(
     context: typer.Context, inventory: Path | None, pulse_hz: int, timeout_s: float | None, as_json: bool
 ) -> None:
-    """Start one board, or all of an inventory, at the same pulse."""
     from firmware_host.board.fleet import open_entry, read_entries
     from firmware_host.board.step import start_together, wait_for_pulse
 
@@ -358,7 +352,6 @@ def _start_together(
 def _change_state(
     context: typer.Context, inventory: Path | None, as_json: bool, ask: Callable[[Board], Any], state: str
 ) -> None:
-    """Bring a board, or all of an inventory, to a state by a request."""
 
     def work(_: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
         ask(board)
@@ -401,11 +394,7 @@ def watchdog(
 
 
 @app.command(cls=LineCommand)
-def status(
-    context: typer.Context,
-    inventory: InventoryFile = None,
-    as_json: AsJson = False,
-) -> None:
+def status(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
     """Show what a board does, and what went wrong since its reset."""
     from firmware_host.board.tables import status_table
 
@@ -532,11 +521,7 @@ def _print_event(
 @app.command(cls=LineCommand)
 @command
 def verify(
-    *,
-    context: typer.Context,
-    payload: BankOptions,
-    inventory: InventoryFile = None,
-    as_json: AsJson = False,
+    *, context: typer.Context, payload: BankOptions, inventory: InventoryFile = None, as_json: AsJson = False
 ) -> None:
     """Compare the active bank with a payload; 7 if it differs.
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from evlcp_sdk.link.resolve import Link
-    from firmware_host.board.board import Board, ProgramResult
     from firmware_host.board.messages import Content
 
 _MOST_NUMBER = 2**32 - 1
@@ -51,8 +50,7 @@ class ContentOptions:
         Path | None, typer.Option(metavar="private.pem", help="Sign the beacon; needs the extra sign.")
     ] = None
     transmitter_id: Annotated[
-        int | None,
-        typer.Option("--id", metavar="ID", min=0, max=_MOST_NUMBER, help="Transmitter id."),
+        int | None, typer.Option("--id", metavar="ID", min=0, max=_MOST_NUMBER, help="Transmitter id.")
     ] = None
     sequence: Annotated[
         int | None,
@@ -142,9 +140,7 @@ class PeriodOptions:
     every: Annotated[
         float | None,
         typer.Option(
-            metavar="SECONDS",
-            min=1.0,
-            help="Send it anew so often, with {time}, {left} and {n} in the text.",
+            metavar="SECONDS", min=1.0, help="Send it anew so often, with {time}, {left} and {n} in the text."
         ),
     ] = None
     count: Annotated[
@@ -164,8 +160,7 @@ def message(
         Path | None, typer.Option("-o", "--out", metavar="FILE.json", help="Write the symbols.")
     ] = None,
     chips: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.npy", help="Write the chips: a row per chip."),
+        Path | None, typer.Option(metavar="FILE.npy", help="Write the chips: a row per chip.")
     ] = None,
     board: LineOptions,
     anew: PeriodOptions,
@@ -184,6 +179,8 @@ def message(
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
+    from firmware_host.board.bank import make_bank
+    from firmware_host.board.board import Settings, provision
     from firmware_host.board.symbols import symbols_table
 
     link = load_link(link_file, overrides or [], Registry.load())
@@ -207,7 +204,8 @@ def message(
             raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
         return
     with line.open() as opened:
-        done = _program_board(opened, symbols, link)
+        with progress_bar("programming") as progress:
+            done = provision(opened, make_bank(symbols, link), Settings(), True, progress)
         print_result(f"{text}, again and again", summary | {"board": asdict(done)} | table, as_json)
         if not as_json:
             print_program_result(done, as_json)
@@ -218,7 +216,6 @@ def message(
 def _write_files(
     symbols: NDArray[np.int64], link: Link, table: dict[str, Any], out: Path | None, chips: Path | None
 ) -> None:
-    """Write the symbols' table and the chips to the files that are given."""
     from evlcp_sdk.files import Outputs
     from firmware_host.board.bank import symbol_chips
 
@@ -230,25 +227,9 @@ def _write_files(
         outputs.commit()
 
 
-def _program_board(board: Board, symbols: NDArray[np.int64], link: Link) -> ProgramResult:
-    """Program a board to send symbols repeatedly."""
-    from firmware_host.board.bank import make_bank
-    from firmware_host.board.board import Settings, provision
-
-    with progress_bar("programming") as progress:
-        return provision(board, make_bank(symbols, link), Settings(), True, progress)
-
-
 def _send_periodically(
-    content: Content,
-    link: Link,
-    line: BoardLine | None,
-    repeat: int,
-    anew: PeriodOptions,
-    *,
-    as_json: bool,
+    content: Content, link: Link, line: BoardLine | None, repeat: int, anew: PeriodOptions, *, as_json: bool
 ) -> None:
-    """Send content periodically until it ends; print the result."""
     from contextlib import suppress
 
     from evlcp_sdk.errors import ConfigError
@@ -292,7 +273,6 @@ def _encode(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int64
 
 
 def _describe(summary: dict[str, Any], written: list[str]) -> str:
-    """The summary of messages and the written files as text."""
     lines = [
         f"{m['kind']:9} {m['bytes']:5} bytes, transmitter {m['transmitter_id']}, sequence {m['sequence']}"
         for m in summary["messages"]

@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 _POLL_S = 0.005
 _MOST_LINES = 64
 
-Ahead = Annotated[
-    int,
-    typer.Option(metavar="N", min=2, help="Packets on the board: few for a short delay."),
-]
+Ahead = Annotated[int, typer.Option(metavar="N", min=2, help="Packets on the board: few for a short delay.")]
 
 
 @command

@@ -133,11 +133,7 @@ _FORMATTERS = {"table": _format_table, "hex": _format_hex, "c": _format_c, "json
 
 @app.command(cls=JsonCommand)
 @command
-def check(
-    *,
-    sent: SymbolOptions,
-    as_json: AsJson = False,
-) -> None:
+def check(*, sent: SymbolOptions, as_json: AsJson = False) -> None:
     """Check balance and flicker.
 
     On-share, longest run, and lines below 3 kHz against IEEE Std 1789-2015.

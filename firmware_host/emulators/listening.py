@@ -14,12 +14,7 @@ _READ_BYTES = 2048
 
 
 def check_listen_address(listen: str, pty: bool) -> None:
-    """Raise ConfigError if the address is invalid, or another program listens there.
-
-    Args:
-        listen: The option `--listen`.
-        pty: Whether it may be a pseudo-terminal.
-    """
+    """Raise ConfigError if an address, or `pty` if not allowed, is invalid, or a program listens there."""
     if listen == "pty" and pty:
         return
     try:

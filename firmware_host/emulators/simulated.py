@@ -120,13 +120,7 @@ class SimulatedBoard:
 
 
 class SimulatedLine(Transport):
-    """A line to a simulated board; its clock is the board's.
-
-    Args:
-        board: The board.
-        name: Its name in messages.
-        step_us: Least time that passes when the host waits.
-    """
+    """A line to a simulated board, whose clock counts; at least `step_us` pass while the host waits."""
 
     def __init__(self, board: SimulatedBoard, name: str = "simulated:", step_us: int = 100) -> None:
         self.name = name

@@ -75,7 +75,6 @@ class RomLoader:
         return bytes(found)
 
     def _drain(self) -> None:
-        """Discard what arrives until the line is quiet."""
         self._received.clear()
         while self.line.read(0.02):
             pass
@@ -182,8 +181,6 @@ class RomLoader:
 
 
 class _FailedError(Exception):
-    """A part of a command was not answered, or refused."""
-
     def __init__(self, silent: bool) -> None:
         super().__init__()
         self.silent = silent

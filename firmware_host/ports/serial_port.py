@@ -84,7 +84,6 @@ def _describe_fault(fault: BaseException) -> str:
 
 
 def _explain_open_fault(url: str, baud: int, fault: Exception) -> str:
-    """The reason why a port cannot be opened, with advice."""
     scheme, on_network, _ = url.partition("://")
     if scheme in ("socket", "rfc2217"):
         return (

@@ -196,10 +196,7 @@ class TraceTransport(Transport):
 
 
 class ReplayTransport(Transport):
-    """Plays a trace back: each received piece comes after those that were sent before it.
-
-    Args:
-        path: A file that `TraceTransport` wrote.
+    """Plays a file of `TraceTransport` back: each received piece comes after those that were sent before it.
 
     Raises:
         InputError: The file cannot be read, or a line of it is wrong.

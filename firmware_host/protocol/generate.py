@@ -55,7 +55,6 @@ def _expand_field(table: Table) -> Table:
 
 
 def _expand_message(table: Table) -> Table:
-    """A request and its reply with their derived values for templates."""
     parts = {part: [_expand_field(f) for f in table[part]] for part in ("request", "reply")}
     for fields in parts.values():
         if [f["since"] for f in fields] != sorted(f["since"] for f in fields):
@@ -148,7 +147,6 @@ def render(template: str, definition: Table) -> str:
 
 
 def _align_columns(rows: Sequence[tuple[str, ...]]) -> str:
-    """Rows as a fenced block of left-aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ("  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows)
     return "\n".join(["```text", *lines, "```"])
