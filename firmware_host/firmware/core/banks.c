@@ -27,7 +27,7 @@ void evlcp_setup_init(struct evlcp_setup *setup, uint32_t tick_hz)
     evlcp_copy(setup->digest, evlcp_digest, 32u);
 }
 
-static bool equal(const uint8_t *a, const uint8_t *b, uint32_t count)
+static bool are_equal(const uint8_t *a, const uint8_t *b, uint32_t count)
 {
     uint32_t differ = 0u;
     for (uint32_t i = 0; i < count; i++)
@@ -39,7 +39,7 @@ bool evlcp_profile_digest_ok(uint8_t profile, const uint8_t digest[32])
 {
     if (profile == EVLCP_PROFILE_CUSTOM)
         return true;
-    return profile < EVLCP_PROFILES && equal(digest, evlcp_profile_digests[profile], 32u);
+    return profile < EVLCP_PROFILES && are_equal(digest, evlcp_profile_digests[profile], 32u);
 }
 
 bool evlcp_banks_range_ok(uint8_t bank, uint32_t offset, uint32_t count)
@@ -47,24 +47,24 @@ bool evlcp_banks_range_ok(uint8_t bank, uint32_t offset, uint32_t count)
     return bank < EVLCP_BANKS && offset <= EVLCP_BANK_BYTES && count <= EVLCP_BANK_BYTES - offset;
 }
 
-bool evlcp_banks_held(const struct evlcp_banks *banks, uint8_t bank)
+bool evlcp_banks_in_use(const struct evlcp_banks *banks, uint8_t bank)
 {
     /* Pending first: the chip interrupt moves a bank from pending to active between the two reads. */
     return bank == atomic_load(&banks->pending) || bank == atomic_load(&banks->active);
 }
 
-/* Whether a held bank is already what is asked for. */
-static bool already(const struct evlcp_plan *plan, const struct evlcp_setup *setup,
+/* Whether a bank in use is already as requested. */
+static bool is_committed(const struct evlcp_plan *plan, const struct evlcp_setup *setup,
                     const struct evlcp_commit_request *request)
 {
     return plan->valid && plan->format == request->format && plan->packets == request->packets &&
            plan->length == request->length && plan->crc == request->crc &&
-           equal((const uint8_t *)&plan->setup, (const uint8_t *)setup, sizeof *setup) &&
-           equal(setup->digest, request->digest, 32u);
+           are_equal((const uint8_t *)&plan->setup, (const uint8_t *)setup, sizeof *setup) &&
+           are_equal(setup->digest, request->digest, 32u);
 }
 
 /* How content of a format is laid out, and what of the setup it is played with. False: not together. */
-static bool plan_of(struct evlcp_plan *plan, const struct evlcp_setup *setup, uint8_t format)
+static bool make_plan(struct evlcp_plan *plan, const struct evlcp_setup *setup, uint8_t format)
 {
     bool chips = setup->hold != 0u;
     if (chips ? setup->chips == 0u || setup->chips > EVLCP_BANK_BYTES
@@ -118,14 +118,14 @@ enum evlcp_status evlcp_banks_stream(struct evlcp_banks *banks, const struct evl
 {
     if (request->bank >= EVLCP_BANKS)
         return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, EVLCP_BANKS - 1u);
-    if (evlcp_banks_held(banks, request->bank))
+    if (evlcp_banks_in_use(banks, request->bank))
         return EVLCP_STATUS_BUSY;
     struct evlcp_plan *plan = &banks->plan[request->bank];
     struct evlcp_stream *stream = &banks->stream[request->bank];
     plan->valid = stream->on = false;
-    if (!plan_of(plan, setup, request->format))
+    if (!make_plan(plan, setup, request->format))
         return EVLCP_STATUS_OUT_OF_RANGE;
-    if (!equal(request->digest, setup->digest, 32u) || !evlcp_profile_digest_ok(setup->profile, setup->digest))
+    if (!are_equal(request->digest, setup->digest, 32u) || !evlcp_profile_digest_ok(setup->profile, setup->digest))
         return EVLCP_STATUS_FOREIGN_CODEBOOK;
     /* One that plays, one that is put in meanwhile. */
     uint32_t room = EVLCP_BANK_BYTES - plan->table_bytes;
@@ -135,7 +135,7 @@ enum evlcp_status evlcp_banks_stream(struct evlcp_banks *banks, const struct evl
         return EVLCP_STATUS_OUT_OF_RANGE;
     evlcp_stream_begin(stream, plan->packet_bytes, plan->table_bytes, room);
     plan->packets = (uint16_t)stream->slots;
-    plan->valid = true; /* its duty is not known before: the guard looks at what is sent */
+    plan->valid = true; /* its duty is unknown: the guard checks each row */
     return EVLCP_STATUS_OK;
 }
 
@@ -146,10 +146,10 @@ enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlc
         return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, EVLCP_BANKS - 1u);
     struct evlcp_plan *plan = &banks->plan[request->bank];
     const uint8_t *content = banks->content[request->bank];
-    if (evlcp_banks_held(banks, request->bank))
-        return already(plan, setup, request) ? EVLCP_STATUS_OK : EVLCP_STATUS_BUSY;
+    if (evlcp_banks_in_use(banks, request->bank))
+        return is_committed(plan, setup, request) ? EVLCP_STATUS_OK : EVLCP_STATUS_BUSY;
     plan->valid = banks->stream[request->bank].on = false;
-    if (request->packets == 0u || !plan_of(plan, setup, request->format))
+    if (request->packets == 0u || !make_plan(plan, setup, request->format))
         return EVLCP_STATUS_OUT_OF_RANGE;
     uint32_t most = (EVLCP_BANK_BYTES - plan->table_bytes) / plan->packet_bytes;
     if (request->packets > most)
@@ -157,7 +157,7 @@ enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlc
     uint32_t length = plan->table_bytes + plan->packet_bytes * request->packets;
     if (request->length != length)
         return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, length);
-    if (!equal(request->digest, setup->digest, 32u) || !evlcp_profile_digest_ok(setup->profile, setup->digest))
+    if (!are_equal(request->digest, setup->digest, 32u) || !evlcp_profile_digest_ok(setup->profile, setup->digest))
         return EVLCP_STATUS_FOREIGN_CODEBOOK;
     uint32_t crc = evlcp_crc32(0u, content, request->length);
     if (crc != request->crc)

@@ -36,7 +36,7 @@ bool evlcp_profile_digest_ok(uint8_t profile, const uint8_t digest[32]);
 bool evlcp_banks_range_ok(uint8_t bank, uint32_t offset, uint32_t count);
 
 /* Whether a bank plays or is about to. */
-bool evlcp_banks_held(const struct evlcp_banks *banks, uint8_t bank);
+bool evlcp_banks_in_use(const struct evlcp_banks *banks, uint8_t bank);
 
 /* Check a bank's content against setup and request, and fill its plan; the plan is valid only on OK. */
 enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlcp_setup *setup,

@@ -19,12 +19,12 @@ struct exchange {
     uint32_t detail;
 };
 
-static bool running(struct evlcp *e)
+static bool is_running(struct evlcp *e)
 {
     return atomic_load(&e->player.running);
 }
 
-static uint16_t faults(struct evlcp *e)
+static uint16_t fault_bits(struct evlcp *e)
 {
     uint32_t bits = e->health.faults | e->latched;
     if (atomic_load(&e->player.chip_lost))
@@ -41,7 +41,7 @@ static uint16_t faults(struct evlcp *e)
     return (uint16_t)bits;
 }
 
-static void test_end(struct evlcp *e)
+static void end_led_test(struct evlcp *e)
 {
     if (!e->test.on)
         return;
@@ -50,7 +50,7 @@ static void test_end(struct evlcp *e)
     e->test.on = false;
 }
 
-static void test_show(const struct evlcp *e)
+static void show_test_led(const struct evlcp *e)
 {
     uint8_t row[EVLCP_ROW_BYTES] = {0};
     row[e->test.led / 8u] = (uint8_t)(0x80u >> (e->test.led % 8u));
@@ -62,21 +62,21 @@ void evlcp_activate(struct evlcp *e, uint8_t bank)
     e->banks.commits++;
     atomic_store(&e->banks.pending, bank);
     /* While chips run the chip interrupt swaps; if it has just ended, evlcp_poll does. */
-    if (!running(e))
+    if (!is_running(e))
         (void)evlcp_banks_swap(&e->banks);
 }
 
-uint32_t evlcp_allowed(const struct evlcp *e, uint32_t level_ma, uint32_t duty_limit)
+uint32_t evlcp_allowed_duty(const struct evlcp *e, uint32_t level_ma, uint32_t duty_limit)
 {
     uint32_t most = level_ma > e->info.mean_max_ma ? 1000u * e->info.mean_max_ma / level_ma : 1000u;
     return most < duty_limit ? most : duty_limit;
 }
 
-bool evlcp_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma, uint16_t duty_limit)
+bool evlcp_set_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma, uint16_t duty_limit)
 {
     e->level_limit_ma = level_limit_ma;
     e->duty_limit = duty_limit;
-    uint32_t duty = evlcp_allowed(e, level_ma, duty_limit);
+    uint32_t duty = evlcp_allowed_duty(e, level_ma, duty_limit);
     uint32_t old = atomic_load(&e->player.guard.duty);
     /* What plays meanwhile keeps to the lower of both. */
     if (duty < old)
@@ -89,16 +89,16 @@ bool evlcp_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma, ui
 }
 
 /* Whether a bank, if there is one, allows for so small a share. */
-static bool dim_enough(const struct evlcp *e, uint8_t bank, uint32_t allowed)
+static bool is_dim_enough(const struct evlcp *e, uint8_t bank, uint32_t allowed)
 {
     return bank == EVLCP_NO_BANK || e->banks.plan[bank].duty <= allowed;
 }
 
 /* What plays, or would with the next START, must not end in the dark. */
-static bool all_dim_enough(const struct evlcp *e, uint32_t allowed)
+static bool are_banks_dim_enough(const struct evlcp *e, uint32_t allowed)
 {
-    return dim_enough(e, atomic_load(&e->banks.pending), allowed) &&
-           dim_enough(e, atomic_load(&e->banks.active), allowed);
+    return is_dim_enough(e, atomic_load(&e->banks.pending), allowed) &&
+           is_dim_enough(e, atomic_load(&e->banks.active), allowed);
 }
 
 static enum evlcp_status out_of_range(struct exchange *x, uint32_t nearest)
@@ -124,7 +124,7 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x)
         e->control.known = false;
         e->control.newest = x->sequence;
         e->control.sequence = x->sequence;
-        evlcp_trust_session(&e->trust, x->sequence);
+        evlcp_trust_begin_session(&e->trust, x->sequence);
     }
     const struct evlcp_hal_info *info = &e->info;
     struct evlcp_hello_reply reply = {
@@ -153,7 +153,7 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x)
     if (e->trust.able) {
         reply.capabilities |= EVLCP_CAPABILITY_TRUST;
         evlcp_copy(reply.challenge, e->trust.challenge, sizeof reply.challenge);
-        evlcp_trust_name(&e->trust, reply.key_name);
+        evlcp_trust_key_name(&e->trust, reply.key_name);
     }
     evlcp_copy(reply.unique_id, info->unique_id, sizeof reply.unique_id);
     evlcp_copy(reply.hal, info->name, sizeof reply.hal);
@@ -161,7 +161,7 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x)
     return EVLCP_STATUS_OK;
 }
 
-static bool chip_rate_ok(const struct evlcp_hal_info *info, uint32_t rate_hz)
+static bool is_chip_rate_ok(const struct evlcp_hal_info *info, uint32_t rate_hz)
 {
     return rate_hz != 0u && rate_hz <= info->chip_rate_max_hz && info->tick_hz % rate_hz == 0u &&
            info->tick_hz / rate_hz <= info->ticks_per_chip_max;
@@ -172,9 +172,9 @@ static uint32_t nearest_chip_rate(const struct evlcp_hal_info *info, uint32_t ra
 {
     uint32_t from = rate_hz < info->chip_rate_max_hz ? rate_hz : info->chip_rate_max_hz;
     for (uint32_t step = 0; step <= info->chip_rate_max_hz; step++) {
-        if (step <= from && chip_rate_ok(info, from - step))
+        if (step <= from && is_chip_rate_ok(info, from - step))
             return from - step;
-        if (chip_rate_ok(info, from + step))
+        if (is_chip_rate_ok(info, from + step))
             return from + step;
     }
     return 0u;
@@ -183,7 +183,7 @@ static uint32_t nearest_chip_rate(const struct evlcp_hal_info *info, uint32_t ra
 static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
 {
     const struct evlcp_configure_request request = evlcp_configure_request_get(x->in);
-    if (!chip_rate_ok(&e->info, request.chip_rate_hz))
+    if (!is_chip_rate_ok(&e->info, request.chip_rate_hz))
         return out_of_range(x, nearest_chip_rate(&e->info, request.chip_rate_hz));
     uint32_t most = EVLCP_BANK_BYTES / EVLCP_FRAME_BYTES;
     if (request.frames == 0u || request.frames > most)
@@ -197,10 +197,10 @@ static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
     uint16_t limit = request.level_limit_ma != 0u ? request.level_limit_ma : e->level_limit_ma;
     uint16_t share = request.duty_limit != 0u ? request.duty_limit : e->duty_limit;
     uint16_t level_ma = e->level_ma < limit ? e->level_ma : limit;
-    uint32_t allowed = evlcp_allowed(e, level_ma, share);
-    if (request.duty_limit != 0u && !all_dim_enough(e, allowed))
+    uint32_t allowed = evlcp_allowed_duty(e, level_ma, share);
+    if (request.duty_limit != 0u && !are_banks_dim_enough(e, allowed))
         return evlcp_refuse(EVLCP_STATUS_TOO_BRIGHT, &x->detail, allowed);
-    if (!evlcp_light(e, level_ma, limit, share))
+    if (!evlcp_set_light(e, level_ma, limit, share))
         return EVLCP_STATUS_HARDWARE_FAULT;
     e->setup.chip_rate_hz = request.chip_rate_hz;
     e->setup.ticks_per_chip = e->info.tick_hz / request.chip_rate_hz;
@@ -263,7 +263,7 @@ static enum evlcp_status on_write(struct evlcp *e, struct exchange *x)
     uint32_t count = x->in_length - EVLCP_WRITE_REQUEST_BYTES;
     if (!evlcp_banks_range_ok(bank, offset, count))
         return out_of_range(x, EVLCP_BANK_BYTES);
-    if (evlcp_banks_held(&e->banks, bank))
+    if (evlcp_banks_in_use(&e->banks, bank))
         return EVLCP_STATUS_BUSY;
     e->banks.plan[bank].valid = false;
     evlcp_copy(e->banks.content[bank] + offset, x->in + EVLCP_WRITE_REQUEST_BYTES, count);
@@ -301,18 +301,18 @@ static enum evlcp_status on_commit(struct evlcp *e, struct exchange *x)
     const struct evlcp_commit_request request = evlcp_commit_request_get(x->in);
     uint8_t active = atomic_load(&e->banks.active);
     uint8_t pending = atomic_load(&e->banks.pending);
-    bool held = request.bank < EVLCP_BANKS && evlcp_banks_held(&e->banks, request.bank);
+    bool held = request.bank < EVLCP_BANKS && evlcp_banks_in_use(&e->banks, request.bank);
     /* Another bank waits for its packet boundary. */
     if (pending != EVLCP_NO_BANK && pending != request.bank)
         return EVLCP_STATUS_BUSY;
     /* The chip timer is not changed while it runs: a chip of another length would be torn. */
-    if (running(e) && e->setup.ticks_per_chip != e->banks.plan[active].setup.ticks_per_chip)
+    if (is_running(e) && e->setup.ticks_per_chip != e->banks.plan[active].setup.ticks_per_chip)
         return evlcp_refuse(EVLCP_STATUS_BUSY, &x->detail, e->banks.plan[active].setup.chip_rate_hz);
     enum evlcp_status status = evlcp_banks_check(&e->banks, &e->setup, &request, &x->detail);
     if (status != EVLCP_STATUS_OK)
         return status;
-    uint32_t allowed = evlcp_allowed(e, e->level_ma, e->duty_limit);
-    if (!dim_enough(e, request.bank, allowed))
+    uint32_t allowed = evlcp_allowed_duty(e, e->level_ma, e->duty_limit);
+    if (!is_dim_enough(e, request.bank, allowed))
         return evlcp_refuse(EVLCP_STATUS_TOO_BRIGHT, &x->detail, allowed);
     if (!held)
         evlcp_activate(e, request.bank);
@@ -327,7 +327,7 @@ static enum evlcp_status on_stream(struct evlcp *e, struct exchange *x)
     uint8_t active = atomic_load(&e->banks.active);
     if (atomic_load(&e->banks.pending) != EVLCP_NO_BANK)
         return EVLCP_STATUS_BUSY;
-    if (running(e) && e->setup.ticks_per_chip != e->banks.plan[active].setup.ticks_per_chip)
+    if (is_running(e) && e->setup.ticks_per_chip != e->banks.plan[active].setup.ticks_per_chip)
         return evlcp_refuse(EVLCP_STATUS_BUSY, &x->detail, e->banks.plan[active].setup.chip_rate_hz);
     enum evlcp_status status = evlcp_banks_stream(&e->banks, &e->setup, &request, &x->detail);
     if (status != EVLCP_STATUS_OK)
@@ -365,7 +365,7 @@ static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
 {
     uint8_t pending = atomic_load(&e->banks.pending);
     uint8_t bank = pending != EVLCP_NO_BANK ? pending : atomic_load(&e->banks.active);
-    if (bank == EVLCP_NO_BANK || evlcp_stream_over(&e->banks.stream[bank]))
+    if (bank == EVLCP_NO_BANK || evlcp_stream_is_over(&e->banks.stream[bank]))
         return EVLCP_STATUS_NOTHING_COMMITTED;
     hal_health(&e->health);
     if ((e->health.faults & HOLDS_DARK) != 0u) {
@@ -376,7 +376,7 @@ static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
     atomic_store(&e->player.chip_lost, false);
     atomic_store(&e->player.over_limit, false);
     e->start = (struct evlcp_start){.waiting = false};
-    test_end(e);
+    end_led_test(e);
     /* evlcp_poll begins; so a START that meets the end of a STOP is not lost. */
     atomic_store(&e->player.want_play, true);
     return EVLCP_STATUS_OK;
@@ -389,7 +389,7 @@ static enum evlcp_status on_start(struct evlcp *e, struct exchange *x)
     bool waits = request.at_pulse != 0u || request.at_clock != 0u;
     if (waits && (e->info.capabilities & EVLCP_CAPABILITY_PULSE) == 0u)
         return EVLCP_STATUS_NOT_SUPPORTED;
-    if (waits && (running(e) || atomic_load(&e->player.want_play)))
+    if (waits && (is_running(e) || atomic_load(&e->player.want_play)))
         return EVLCP_STATUS_BUSY;
     if (request.at_pulse != 0u) {
         uint8_t bank = atomic_load(&e->banks.active);
@@ -417,24 +417,24 @@ static enum evlcp_status on_level(struct evlcp *e, struct exchange *x)
         return EVLCP_STATUS_NOT_SUPPORTED;
     if (request.level_ma > e->level_limit_ma)
         return out_of_range(x, e->level_limit_ma);
-    uint32_t allowed = evlcp_allowed(e, request.level_ma, e->duty_limit);
-    if (!all_dim_enough(e, allowed))
+    uint32_t allowed = evlcp_allowed_duty(e, request.level_ma, e->duty_limit);
+    if (!are_banks_dim_enough(e, allowed))
         return evlcp_refuse(EVLCP_STATUS_TOO_BRIGHT, &x->detail, allowed);
-    test_end(e);
-    return evlcp_light(e, request.level_ma, e->level_limit_ma, e->duty_limit) ? EVLCP_STATUS_OK
+    end_led_test(e);
+    return evlcp_set_light(e, request.level_ma, e->level_limit_ma, e->duty_limit) ? EVLCP_STATUS_OK
                                                                                : EVLCP_STATUS_HARDWARE_FAULT;
 }
 
-static uint8_t state(struct evlcp *e)
+static uint8_t current_state(struct evlcp *e)
 {
-    if (running(e)) {
+    if (is_running(e)) {
         if (!atomic_load(&e->player.want_play))
             return EVLCP_STATE_STOPPING;
         return e->player.idle ? EVLCP_STATE_IDLE_PATTERN : EVLCP_STATE_PLAYING;
     }
     if (e->test.on)
         return EVLCP_STATE_TESTING;
-    if ((faults(e) & (HOLDS_DARK | EVLCP_FAULT_CHIP_LOST | EVLCP_FAULT_OVER_LIMIT)) != 0u)
+    if ((fault_bits(e) & (HOLDS_DARK | EVLCP_FAULT_CHIP_LOST | EVLCP_FAULT_OVER_LIMIT)) != 0u)
         return EVLCP_STATE_FAULT;
     if (e->start.waiting && atomic_load(&e->player.want_play))
         return EVLCP_STATE_WAITING;
@@ -447,9 +447,9 @@ static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
     struct evlcp_pulse pulse;
     (void)hal_pulse(&pulse);
     struct evlcp_status_reply reply = {
-        .state = state(e),
-        .faults = faults(e),
-        .pending_bank = atomic_load(&e->banks.pending), /* first, as in evlcp_banks_held */
+        .state = current_state(e),
+        .faults = fault_bits(e),
+        .pending_bank = atomic_load(&e->banks.pending), /* first, as in evlcp_banks_in_use */
         .commits = e->banks.commits,
         .packets_sent = atomic_load(&e->player.packets_sent),
         .chips_sent = atomic_load(&e->player.chips_sent),
@@ -465,7 +465,7 @@ static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
         .temperature_dc = e->health.temperature_dc,
         .watchdog = e->watch.action,
         .watchdog_ms = e->watch.timeout_ms,
-        .silence_ms = hal_millis() - e->watch.asked_ms,
+        .silence_ms = hal_millis() - e->watch.silence_from_ms,
         .uptime_ms = hal_millis(),
         .clock = hal_clock(),
         .pulses = pulse.count,
@@ -534,7 +534,7 @@ static enum evlcp_status on_recall(struct evlcp *e, struct exchange *x)
 static enum evlcp_status on_led_test(struct evlcp *e, struct exchange *x)
 {
     const struct evlcp_led_test_request request = evlcp_led_test_request_get(x->in);
-    if (running(e) || atomic_load(&e->player.want_play))
+    if (is_running(e) || atomic_load(&e->player.want_play))
         return EVLCP_STATUS_BUSY;
     if (request.last >= EVLCP_LEDS || request.first > request.last)
         return out_of_range(x, EVLCP_LEDS - 1u);
@@ -544,7 +544,7 @@ static enum evlcp_status on_led_test(struct evlcp *e, struct exchange *x)
     if ((e->health.faults & HOLDS_DARK) != 0u)
         return evlcp_refuse(EVLCP_STATUS_HARDWARE_FAULT, &x->detail, e->health.faults);
     /* A LED is on for as long as the host likes: with no more than the mean that it may have. */
-    uint32_t most = (uint32_t)e->level_ma * evlcp_allowed(e, e->level_ma, e->duty_limit) / 1000u;
+    uint32_t most = (uint32_t)e->level_ma * evlcp_allowed_duty(e, e->level_ma, e->duty_limit) / 1000u;
     if (!hal_level((uint16_t)most))
         return evlcp_refuse(EVLCP_STATUS_HARDWARE_FAULT, &x->detail, 0u);
     e->test.on = true;
@@ -552,16 +552,16 @@ static enum evlcp_status on_led_test(struct evlcp *e, struct exchange *x)
     e->test.last = request.last;
     e->test.dwell_ms = request.dwell_ms;
     e->test.since_ms = hal_millis();
-    test_show(e);
+    show_test_led(e);
     return EVLCP_STATUS_OK;
 }
 
 /* Flash of an image is written and erased only in the dark: the processor of a single-bank part stands meanwhile. */
-static enum evlcp_status may_update(struct evlcp *e)
+static enum evlcp_status check_update_allowed(struct evlcp *e)
 {
     if ((e->info.capabilities & EVLCP_CAPABILITY_UPDATE) == 0u)
         return EVLCP_STATUS_NOT_SUPPORTED;
-    return running(e) || atomic_load(&e->player.want_play) || e->test.on ? EVLCP_STATUS_BUSY : EVLCP_STATUS_OK;
+    return is_running(e) || atomic_load(&e->player.want_play) || e->test.on ? EVLCP_STATUS_BUSY : EVLCP_STATUS_OK;
 }
 
 static enum evlcp_status on_update_status(struct evlcp *e, struct exchange *x)
@@ -569,7 +569,7 @@ static enum evlcp_status on_update_status(struct evlcp *e, struct exchange *x)
     struct evlcp_update_status_reply reply = {0};
     if ((e->info.capabilities & EVLCP_CAPABILITY_UPDATE) == 0u)
         return EVLCP_STATUS_NOT_SUPPORTED;
-    evlcp_update_tell(&reply);
+    evlcp_update_fill_status(&reply);
     evlcp_copy(reply.target, e->info.target, sizeof reply.target);
     x->out_length = evlcp_update_status_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
@@ -579,7 +579,7 @@ static enum evlcp_status on_update_write(struct evlcp *e, struct exchange *x)
 {
     uint32_t offset = evlcp_get32(x->in);
     uint32_t count = x->in_length - EVLCP_UPDATE_WRITE_REQUEST_BYTES;
-    enum evlcp_status status = may_update(e);
+    enum evlcp_status status = check_update_allowed(e);
     if (status == EVLCP_STATUS_OK)
         status = evlcp_update_write(&e->update, offset, x->in + EVLCP_UPDATE_WRITE_REQUEST_BYTES, count, &x->detail);
     if (status == EVLCP_STATUS_OK) {
@@ -592,14 +592,14 @@ static enum evlcp_status on_update_write(struct evlcp *e, struct exchange *x)
 static enum evlcp_status on_update_begin(struct evlcp *e, struct exchange *x)
 {
     const struct evlcp_update_begin_request request = evlcp_update_begin_request_get(x->in);
-    enum evlcp_status status = may_update(e);
+    enum evlcp_status status = check_update_allowed(e);
     return status == EVLCP_STATUS_OK ? evlcp_update_begin(&e->update, &request, &x->detail) : status;
 }
 
 static enum evlcp_status on_update_commit(struct evlcp *e, struct exchange *x)
 {
     struct evlcp_update_commit_reply reply = {0};
-    enum evlcp_status status = may_update(e);
+    enum evlcp_status status = check_update_allowed(e);
     if (status == EVLCP_STATUS_OK)
         status = evlcp_update_commit(&e->update, &reply.sequence, &x->detail);
     if (status == EVLCP_STATUS_OK)
@@ -610,7 +610,7 @@ static enum evlcp_status on_update_commit(struct evlcp *e, struct exchange *x)
 static enum evlcp_status on_update_restart(struct evlcp *e, struct exchange *x)
 {
     (void)x;
-    enum evlcp_status status = may_update(e);
+    enum evlcp_status status = check_update_allowed(e);
     if (status == EVLCP_STATUS_OK) {
         e->update.restart = true;
         e->update.restart_ms = hal_millis();
@@ -621,12 +621,12 @@ static enum evlcp_status on_update_restart(struct evlcp *e, struct exchange *x)
 static enum evlcp_status on_update_confirm(struct evlcp *e, struct exchange *x)
 {
     (void)x;
-    enum evlcp_status status = may_update(e);
+    enum evlcp_status status = check_update_allowed(e);
     return status == EVLCP_STATUS_OK ? evlcp_update_confirm() : status;
 }
 
 /* No packet is taken from now on, and none of a stream is left for another START. */
-static void play_no_more(struct evlcp *e)
+static void stop_playing(struct evlcp *e)
 {
     atomic_store(&e->player.want_play, false);
     for (uint8_t bank = 0; bank < EVLCP_BANKS; bank++)
@@ -637,24 +637,24 @@ static enum evlcp_status on_key(struct evlcp *e, struct exchange *x)
 {
     if (!e->trust.able)
         return EVLCP_STATUS_NOT_SUPPORTED;
-    evlcp_trust_set(&e->trust, x->in);
+    evlcp_trust_set_key(&e->trust, x->in);
     return EVLCP_STATUS_OK;
 }
 
 static enum evlcp_status on_stop(struct evlcp *e, struct exchange *x)
 {
     (void)x;
-    play_no_more(e);
-    test_end(e);
+    stop_playing(e);
+    end_led_test(e);
     return EVLCP_STATUS_OK;
 }
 
 static enum evlcp_status on_blank(struct evlcp *e, struct exchange *x)
 {
     (void)x;
-    play_no_more(e);
+    stop_playing(e);
     evlcp_player_blank(&e->player);
-    test_end(e);
+    end_led_test(e);
     return EVLCP_STATUS_OK;
 }
 
@@ -680,19 +680,19 @@ static const struct shape *shape_of(uint8_t type)
     return 0;
 }
 
-/* Sequence numbers wrap; half of them count as after `than`. */
-static bool after(uint16_t sequence, uint16_t than)
+/* Sequence numbers wrap; half of them are after `than`. */
+static bool is_after(uint16_t sequence, uint16_t than)
 {
     return (int16_t)(uint16_t)(sequence - than) > 0;
 }
 
-/* Whether it is the latest control request again: that is answered again and not done again. */
-static bool repeated(const struct evlcp_control *c, const struct evlcp_datagram *d)
+/* Whether it repeats the latest control request, which is then answered again, but not done again. */
+static bool is_repetition(const struct evlcp_control *c, const struct evlcp_datagram *d)
 {
     return c->known && d->sequence == c->sequence && d->type == c->type;
 }
 
-static enum evlcp_status controlled(struct evlcp *e, const struct shape *shape, struct exchange *x)
+static enum evlcp_status run_control(struct evlcp *e, const struct shape *shape, struct exchange *x)
 {
     struct evlcp_control *c = &e->control;
     enum evlcp_status status = shape->handle(e, x);
@@ -708,17 +708,17 @@ static enum evlcp_status controlled(struct evlcp *e, const struct shape *shape, 
     return status;
 }
 
-/* What the watchdog did is told until a control request: a host that comes back says HELLO first. */
-static void heard(struct evlcp *e)
+/* What the watchdog did is reported until a control request, as a host that returns sends HELLO first. */
+static void note_host(struct evlcp *e)
 {
-    e->watch.heard_ms = hal_millis();
+    e->watch.host_ms = hal_millis();
     e->watch.fired = false;
     atomic_store(&e->player.want_idle, false);
 }
 
 static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *d, bool sealed, struct exchange *x)
 {
-    /* Who has no key may look, but neither change anything nor stand in for the host. */
+    /* A host without the key may read the state, but not change it, nor reset the watchdog. */
     bool trusted = sealed || !e->trust.locked;
     const struct shape *shape = shape_of(d->type);
     if (shape == 0)
@@ -735,21 +735,21 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
     if (d->type == EVLCP_TYPE_HELLO) {
         enum evlcp_status status = on_hello(e, x);
         if (status == EVLCP_STATUS_OK && trusted)
-            heard(e);
+            note_host(e);
         return status;
     }
     if (d->session != e->session || e->session == EVLCP_NO_SESSION)
         return EVLCP_STATUS_NO_SESSION;
     struct evlcp_control *c = &e->control;
-    bool again = shape->control && repeated(c, d); /* a KEY, say, whose answer was lost */
+    bool again = shape->control && is_repetition(c, d); /* a KEY, say, whose answer was lost */
     if (!trusted && !shape->query && !again)
         return EVLCP_STATUS_NEEDS_KEY;
     if (trusted) {
-        heard(e);
+        note_host(e);
         if (d->type != EVLCP_TYPE_STATUS)
-            e->watch.asked_ms = e->watch.heard_ms;
+            e->watch.silence_from_ms = e->watch.host_ms;
     }
-    if (trusted && after(d->sequence, c->newest)) {
+    if (trusted && is_after(d->sequence, c->newest)) {
         c->newest = d->sequence;
         /* Keep the last control request within the half of the numbers that counts as before. */
         if ((uint16_t)(c->newest - c->sequence) > 0x4000u) {
@@ -759,19 +759,19 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
     }
     if (shape->control)
         e->watch.acted = e->watch.acted && !trusted;
-    if (shape->control && repeated(c, d)) {
+    if (shape->control && is_repetition(c, d)) {
         evlcp_copy(x->out, c->reply, c->length);
         x->out_length = c->length;
         x->detail = evlcp_get32(c->reply);
         return (enum evlcp_status)c->status;
     }
-    if (!shape->query && !after(d->sequence, c->sequence))
+    if (!shape->query && !is_after(d->sequence, c->sequence))
         return EVLCP_STATUS_STALE;
     if (shape->control)
-        return controlled(e, shape, x);
+        return run_control(e, shape, x);
     enum evlcp_status status = shape->handle(e, x);
     if (trusted && d->type == EVLCP_TYPE_STATUS)
-        e->watch.asked_ms = e->watch.heard_ms; /* after, for the status tells how long it was */
+        e->watch.silence_from_ms = e->watch.host_ms; /* after it, as the status reports the silence */
     return status;
 }
 
@@ -785,7 +785,7 @@ static void answer(struct evlcp *e, struct evlcp_datagram *d)
     e->requests++;
     enum evlcp_status status = EVLCP_STATUS_OK;
     if (d->session == e->session && e->session != EVLCP_NO_SESSION)
-        status = evlcp_trust_open(&e->trust, d, &sealed);
+        status = evlcp_trust_unseal(&e->trust, d, &sealed);
     x.in_length = d->length;
     if (status == EVLCP_STATUS_OK)
         status = dispatch(e, d, sealed, &x);
@@ -804,10 +804,10 @@ static void answer(struct evlcp *e, struct evlcp_datagram *d)
 
 /* ---- what happens by itself ---- */
 
-static void watch(struct evlcp *e, uint32_t now)
+static void check_watchdog(struct evlcp *e, uint32_t now)
 {
     if (e->watch.action == EVLCP_WATCHDOG_KEEP || e->watch.fired ||
-        now - e->watch.heard_ms < e->watch.timeout_ms || !atomic_load(&e->player.want_play))
+        now - e->watch.host_ms < e->watch.timeout_ms || !atomic_load(&e->player.want_play))
         return;
     e->watch.fired = true;
     e->watch.acted = true;
@@ -827,24 +827,24 @@ static void check_health(struct evlcp *e, uint32_t now)
         return;
     e->latched |= e->health.faults & HOLDS_DARK;
     /* Whatever lights the LEDs, even if an earlier fault is still latched. */
-    if (running(e) || atomic_load(&e->player.want_play) || e->test.on) {
+    if (is_running(e) || atomic_load(&e->player.want_play) || e->test.on) {
         atomic_store(&e->player.want_play, false);
         evlcp_player_blank(&e->player);
-        test_end(e);
+        end_led_test(e);
     }
 }
 
-static void walk(struct evlcp *e, uint32_t now)
+static void step_led_test(struct evlcp *e, uint32_t now)
 {
     if (!e->test.on || now - e->test.since_ms < e->test.dwell_ms)
         return;
     e->test.since_ms += e->test.dwell_ms;
     if (e->test.led == e->test.last) {
-        test_end(e);
+        end_led_test(e);
         return;
     }
     e->test.led++;
-    test_show(e);
+    show_test_led(e);
 }
 
 void evlcp_init(struct evlcp *e)
@@ -854,14 +854,14 @@ void evlcp_init(struct evlcp *e)
     hal_info(&e->info);
     evlcp_banks_init(&e->banks);
     evlcp_setup_init(&e->setup, e->info.tick_hz);
-    e->watch.heard_ms = e->watch.asked_ms = hal_millis();
+    e->watch.host_ms = e->watch.silence_from_ms = hal_millis();
     if (e->info.burst_chips > EVLCP_BURST_MOST)
         e->info.burst_chips = EVLCP_BURST_MOST;
     e->player.guard.burst = 1000u * e->info.burst_chips;
-    (void)evlcp_light(e, e->info.level_default_ma, e->info.level_max_ma, 1000u);
+    (void)evlcp_set_light(e, e->info.level_default_ma, e->info.level_max_ma, 1000u);
     hal_health(&e->health);
     e->health_ms = hal_millis();
-    evlcp_settings_key(e);
+    evlcp_settings_load_key(e);
     struct evlcp_recall_reply recalled;
     uint32_t detail;
     if (evlcp_settings_recall(e, true, &recalled) == EVLCP_STATUS_OK)
@@ -878,11 +878,11 @@ void evlcp_chip(struct evlcp *e)
     evlcp_player_chip(&e->player, &e->banks);
 }
 
-void evlcp_failed(struct evlcp *e)
+void evlcp_hardware_failed(struct evlcp *e)
 {
     atomic_store(&e->player.want_play, false);
     evlcp_player_blank(&e->player);
-    test_end(e);
+    end_led_test(e);
     hal_health(&e->health);
     e->latched |= e->health.faults & HOLDS_DARK;
     if ((e->health.faults & HOLDS_DARK) == 0u)
@@ -890,7 +890,7 @@ void evlcp_failed(struct evlcp *e)
 }
 
 /* Whether chips may begin: at once, or soon enough for the hardware to wait for the exact moment. */
-static bool due(struct evlcp *e)
+static bool is_start_due(struct evlcp *e)
 {
     if (!e->start.waiting)
         return true;
@@ -923,19 +923,19 @@ void evlcp_poll(struct evlcp *e)
     uint32_t lost = hal_lost();
     if (lost != 0u)
         atomic_fetch_add(&e->link.overflow_errors, lost);
-    if (!running(e)) {
+    if (!is_running(e)) {
         (void)evlcp_banks_swap(&e->banks);
         if (atomic_load(&e->player.chip_lost) || atomic_load(&e->player.over_limit))
             atomic_store(&e->player.want_play, false);
-        if (atomic_load(&e->player.want_play) && atomic_load(&e->banks.active) != EVLCP_NO_BANK && due(e))
+        if (atomic_load(&e->player.want_play) && atomic_load(&e->banks.active) != EVLCP_NO_BANK && is_start_due(e))
             evlcp_player_begin(&e->player, &e->banks);
     }
     struct evlcp_pulse pulse;
-    if (!hal_pulse(&pulse) && running(e))
+    if (!hal_pulse(&pulse) && is_running(e))
         e->start.missed = true;
-    watch(e, now);
+    check_watchdog(e, now);
     check_health(e, now);
-    walk(e, now);
-    if (e->update.restart && now - e->update.restart_ms >= RESTART_AFTER_MS && !running(e))
+    step_led_test(e, now);
+    if (e->update.restart && now - e->update.restart_ms >= RESTART_AFTER_MS && !is_running(e))
         hal_restart();
 }

@@ -20,8 +20,8 @@
 struct evlcp_watch {
     uint8_t action;
     uint32_t timeout_ms;
-    uint32_t heard_ms; /* the latest request */
-    uint32_t asked_ms; /* the same, HELLO left out */
+    uint32_t host_ms;         /* time of the latest request */
+    uint32_t silence_from_ms; /* the same without HELLO */
     bool fired;        /* it acts, until the next request */
     bool acted;        /* it did, until the next control request */
 };
@@ -89,7 +89,7 @@ void evlcp_chip(struct evlcp *e);
 
 /* The hardware failed, and the HAL has gone dark by itself: from the main loop, once for each failure. The fault is
    what the health says, or CHIP_LOST; the LEDs stay dark until START finds it gone. */
-void evlcp_failed(struct evlcp *e);
+void evlcp_hardware_failed(struct evlcp *e);
 
 /* Everything that is not urgent. */
 void evlcp_poll(struct evlcp *e);
@@ -99,13 +99,13 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
 enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, struct evlcp_recall_reply *reply);
 
 /* The key of the newest slot that is whole. */
-void evlcp_settings_key(struct evlcp *e);
+void evlcp_settings_load_key(struct evlcp *e);
 
 /* Share of time that a LED may be on with a current and a limit, permille. */
-uint32_t evlcp_allowed(const struct evlcp *e, uint32_t level_ma, uint32_t duty_limit);
+uint32_t evlcp_allowed_duty(const struct evlcp *e, uint32_t level_ma, uint32_t duty_limit);
 
 /* Set current and limits, as they are allowed together; false if the hardware does not follow. */
-bool evlcp_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma, uint16_t duty_limit);
+bool evlcp_set_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma, uint16_t duty_limit);
 
 /* Make a checked bank active: now if nothing plays, else at the packet boundary. */
 void evlcp_activate(struct evlcp *e, uint8_t bank);

@@ -29,7 +29,7 @@ static uint32_t subtract_half(uint32_t a, uint32_t b)
 
 static const uint32_t lit[4] = {0u, 1000u, 1000u << 16, 1000u << 16 | 1000u};
 
-bool evlcp_guard_take(struct evlcp_guard *guard, const uint8_t row[EVLCP_ROW_BYTES])
+bool evlcp_guard_check_row(struct evlcp_guard *guard, const uint8_t row[EVLCP_ROW_BYTES])
 {
     uint32_t duty = atomic_load(&guard->duty) * 0x10001u;
     uint32_t burst = guard->burst * 0x10001u;
@@ -47,7 +47,7 @@ bool evlcp_guard_take(struct evlcp_guard *guard, const uint8_t row[EVLCP_ROW_BYT
     return beyond == 0u;
 }
 
-void evlcp_guard_rest(struct evlcp_guard *guard, uint32_t chips)
+void evlcp_guard_add_dark(struct evlcp_guard *guard, uint32_t chips)
 {
     uint32_t duty = atomic_load(&guard->duty);
     uint32_t gone = duty != 0u && chips > 0xffffu / duty ? 0xffffu : chips * duty;
@@ -55,7 +55,7 @@ void evlcp_guard_rest(struct evlcp_guard *guard, uint32_t chips)
         guard->excess[i] = SUBTRACT_HALVES(guard->excess[i], gone * 0x10001u);
 }
 
-static uint32_t ones(uint32_t word)
+static uint32_t count_ones(uint32_t word)
 {
     uint32_t n = 0u;
     for (; word != 0u; word &= word - 1u)
@@ -65,7 +65,7 @@ static uint32_t ones(uint32_t word)
 
 /* The most that one of the LEDs, or clusters, is on, over `count` chips of a bit each: counters side by side, a bit
    of each in every word. */
-static uint32_t most_of_rows(const uint8_t *rows, uint32_t count, uint32_t bytes)
+static uint32_t most_chips_of_rows(const uint8_t *rows, uint32_t count, uint32_t bytes)
 {
     uint32_t bits[COUNT_BITS][WORDS_A_ROW] = {{0}};
     uint32_t most = 0u;
@@ -94,16 +94,16 @@ static uint32_t most_of_rows(const uint8_t *rows, uint32_t count, uint32_t bytes
     return most;
 }
 
-static uint32_t most_of_words(const struct evlcp_plan *plan, const uint8_t *words)
+static uint32_t most_chips_of_words(const struct evlcp_plan *plan, const uint8_t *words)
 {
     const struct evlcp_setup *setup = &plan->setup;
     uint32_t pilots = ((uint32_t)setup->frames + setup->pilot_every - 1u) / setup->pilot_every;
     uint32_t frames = (uint32_t)plan->packets * setup->frames;
     uint32_t most = 0u;
     for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++) {
-        uint32_t on = plan->packets * (ones(setup->preamble) + pilots * ones(setup->pilots[k]));
+        uint32_t on = plan->packets * (count_ones(setup->preamble) + pilots * count_ones(setup->pilots[k]));
         for (uint32_t f = 0; f < frames; f++)
-            on += ones(evlcp_get16(words + f * EVLCP_FRAME_BYTES + 2u * k));
+            on += count_ones(evlcp_get16(words + f * EVLCP_FRAME_BYTES + 2u * k));
         most = on > most ? on : most;
     }
     return most;
@@ -113,7 +113,7 @@ uint16_t evlcp_guard_duty(const struct evlcp_plan *plan, const uint8_t *content)
 {
     uint32_t chips = plan->packets * plan->packet_chips / (plan->setup.hold != 0u ? plan->setup.hold : 1u);
     uint32_t on = plan->format == EVLCP_FORMAT_WORDS
-                      ? most_of_words(plan, content)
-                      : most_of_rows(content + plan->table_bytes, chips, plan->chip_bytes);
+                      ? most_chips_of_words(plan, content)
+                      : most_chips_of_rows(content + plan->table_bytes, chips, plan->chip_bytes);
     return (uint16_t)((on * 1000u + chips - 1u) / chips);
 }

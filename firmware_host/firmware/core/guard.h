@@ -18,11 +18,11 @@ struct evlcp_guard {
     uint32_t excess[EVLCP_LEDS / 2u];
 };
 
-/* A row is next. False: a LED would be on for longer than the limits allow, the row must not be shown. */
-bool evlcp_guard_take(struct evlcp_guard *guard, const uint8_t row[EVLCP_ROW_BYTES]);
+/* Check and count the next row. False: a LED would be on for longer than the limits allow; do not show it. */
+bool evlcp_guard_check_row(struct evlcp_guard *guard, const uint8_t row[EVLCP_ROW_BYTES]);
 
-/* All LEDs were dark for so many chips. */
-void evlcp_guard_rest(struct evlcp_guard *guard, uint32_t chips);
+/* Count chips during which all LEDs were dark. */
+void evlcp_guard_add_dark(struct evlcp_guard *guard, uint32_t chips);
 
 /* Share of time that a LED is on when the content is played over and over, that of the brightest, permille, rounded
    up. */

@@ -29,7 +29,7 @@ static void append(struct evlcp_link *link, uint8_t byte)
 }
 
 /* Whether the delimiter ends a good datagram; counts the others. */
-static bool ended(struct evlcp_link *link, struct evlcp_datagram *datagram)
+static bool finish_datagram(struct evlcp_link *link, struct evlcp_datagram *datagram)
 {
     uint32_t length = link->length;
     bool good = link->open && !link->broken && link->left == 0u;
@@ -60,10 +60,10 @@ static bool ended(struct evlcp_link *link, struct evlcp_datagram *datagram)
     return true;
 }
 
-static bool take(struct evlcp_link *link, uint8_t byte, struct evlcp_datagram *datagram)
+static bool decode_byte(struct evlcp_link *link, uint8_t byte, struct evlcp_datagram *datagram)
 {
     if (byte == 0u)
-        return ended(link, datagram);
+        return finish_datagram(link, datagram);
     if (!link->open) {
         link->open = true;
         link->full_block = true; /* no zero stands before the first block */
@@ -88,7 +88,7 @@ bool evlcp_link_next(struct evlcp_link *link, struct evlcp_datagram *datagram)
     uint32_t head = atomic_load_explicit(&link->head, memory_order_acquire);
     bool found = false;
     while (!found && tail != head) {
-        found = take(link, link->ring[tail % EVLCP_RING_BYTES], datagram);
+        found = decode_byte(link, link->ring[tail % EVLCP_RING_BYTES], datagram);
         tail++;
     }
     atomic_store_explicit(&link->tail, tail, memory_order_release);
@@ -101,7 +101,7 @@ struct encoder {
     uint32_t code_at;
 };
 
-static void encode(struct encoder *e, uint8_t byte)
+static void encode_byte(struct encoder *e, uint8_t byte)
 {
     uint32_t run = e->length - e->code_at; /* the code itself and the bytes after it */
     if (run == 0xffu) {
@@ -130,11 +130,11 @@ void evlcp_link_put(struct evlcp_link *link, const struct evlcp_datagram *datagr
 
     struct encoder e = {.wire = link->wire, .length = 1u, .code_at = 0u};
     for (uint32_t i = 0; i < EVLCP_HEADER_BYTES; i++)
-        encode(&e, header[i]);
+        encode_byte(&e, header[i]);
     for (uint32_t i = 0; i < datagram->length; i++)
-        encode(&e, datagram->payload[i]);
+        encode_byte(&e, datagram->payload[i]);
     for (uint32_t i = 0; i < EVLCP_CRC_BYTES; i++)
-        encode(&e, tail[i]);
+        encode_byte(&e, tail[i]);
     e.wire[e.code_at] = (uint8_t)(e.length - e.code_at);
     e.wire[e.length++] = 0u;
     link->wire_length = e.length;

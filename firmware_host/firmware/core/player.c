@@ -48,7 +48,7 @@ static void compose(struct evlcp_player *player)
         player->packet_done = evlcp_cursor_row(&player->cursor, player->row);
     }
     /* The last thing between what is played and the LEDs. */
-    if (!evlcp_guard_take(&player->guard, player->row)) {
+    if (!evlcp_guard_check_row(&player->guard, player->row)) {
         atomic_store(&player->over_limit, true);
         player->halt = true;
     }
@@ -81,7 +81,7 @@ void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks)
     uint32_t rested_ms = hal_millis() - player->dark_ms;
     if (rested_ms > 1000u)
         rested_ms = 1000u; /* longer than any burst */
-    evlcp_guard_rest(&player->guard, rested_ms * plan->setup.chip_rate_hz / 1000u);
+    evlcp_guard_add_dark(&player->guard, rested_ms * plan->setup.chip_rate_hz / 1000u);
     seek(player, banks, 0u);
     if (player->halt)
         return; /* the end of a stream that has played */

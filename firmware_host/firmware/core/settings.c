@@ -120,9 +120,9 @@ static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct evlcp
     if (status != EVLCP_STATUS_OK)
         return status;
     if (s->level_limit_ma > e->info.level_max_ma || s->level_ma > s->level_limit_ma || s->duty_limit > 1000u ||
-        !evlcp_light(e, s->level_ma, s->level_limit_ma, s->duty_limit))
+        !evlcp_set_light(e, s->level_ma, s->level_limit_ma, s->duty_limit))
         return EVLCP_STATUS_HARDWARE_FAULT;
-    if (e->banks.plan[bank].duty > evlcp_allowed(e, s->level_ma, e->duty_limit))
+    if (e->banks.plan[bank].duty > evlcp_allowed_duty(e, s->level_ma, e->duty_limit))
         return EVLCP_STATUS_TOO_BRIGHT;
     e->setup = setup;
     e->watch.action = s->watchdog <= EVLCP_WATCHDOG_DARK ? s->watchdog : EVLCP_WATCHDOG_KEEP;
@@ -156,7 +156,7 @@ enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, st
     return EVLCP_STATUS_EMPTY_SLOT;
 }
 
-void evlcp_settings_key(struct evlcp *e)
+void evlcp_settings_load_key(struct evlcp *e)
 {
     struct evlcp_saved found[EVLCP_SLOTS];
     bool valid[EVLCP_SLOTS];
@@ -165,5 +165,5 @@ void evlcp_settings_key(struct evlcp *e)
     /* Not that of an older slot, whatever RECALL does: a key that was changed is not believed again. */
     uint8_t last = newest(e, found, valid);
     if (valid[last])
-        evlcp_trust_set(&e->trust, found[last].key);
+        evlcp_trust_set_key(&e->trust, found[last].key);
 }

@@ -37,7 +37,7 @@ void evlcp_stream_end(struct evlcp_stream *stream)
     atomic_store(&stream->pushed, atomic_load(&stream->begun));
 }
 
-bool evlcp_stream_over(const struct evlcp_stream *stream)
+bool evlcp_stream_is_over(const struct evlcp_stream *stream)
 {
     return stream->on && atomic_load(&stream->ended) && atomic_load(&stream->begun) == atomic_load(&stream->pushed);
 }

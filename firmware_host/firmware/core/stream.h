@@ -8,7 +8,7 @@
 
 #include "composer.h"
 
-#define EVLCP_STREAM_IDLE_CHIPS 2u /* an empty queue is looked at again after these */
+#define EVLCP_STREAM_IDLE_CHIPS 2u /* an empty queue is checked again after these */
 
 /* The main loop begins one while its bank is spare; then it writes `pushed`, `ended` and `filled`, and the chip
    interrupt the rest. */
@@ -43,7 +43,7 @@ void evlcp_stream_push(struct evlcp_stream *stream, uint8_t *content, uint32_t n
 void evlcp_stream_end(struct evlcp_stream *stream);
 
 /* Whether it has ended, and all that was put in has begun to play. */
-bool evlcp_stream_over(const struct evlcp_stream *stream);
+bool evlcp_stream_is_over(const struct evlcp_stream *stream);
 
 /* Take the next packet out, at a packet boundary; what it held before may be overwritten from now on. `hold`: not
    now, show the idle pattern. */

@@ -3,7 +3,7 @@
 #include "hal.h"
 #include "sha256.h"
 
-void evlcp_trust_set(struct evlcp_trust *trust, const uint8_t key[EVLCP_KEY_BYTES])
+void evlcp_trust_set_key(struct evlcp_trust *trust, const uint8_t key[EVLCP_KEY_BYTES])
 {
     uint32_t any = 0u;
     for (uint32_t i = 0; i < EVLCP_KEY_BYTES; i++)
@@ -12,7 +12,7 @@ void evlcp_trust_set(struct evlcp_trust *trust, const uint8_t key[EVLCP_KEY_BYTE
     trust->locked = any != 0u;
 }
 
-void evlcp_trust_name(const struct evlcp_trust *trust, uint8_t name[EVLCP_KEY_NAME_BYTES])
+void evlcp_trust_key_name(const struct evlcp_trust *trust, uint8_t name[EVLCP_KEY_NAME_BYTES])
 {
     uint8_t digest[EVLCP_SHA256_BYTES] = {0};
     struct evlcp_sha256 hash;
@@ -24,7 +24,7 @@ void evlcp_trust_name(const struct evlcp_trust *trust, uint8_t name[EVLCP_KEY_NA
     evlcp_copy(name, digest, EVLCP_KEY_NAME_BYTES);
 }
 
-void evlcp_trust_session(struct evlcp_trust *trust, uint16_t sequence)
+void evlcp_trust_begin_session(struct evlcp_trust *trust, uint16_t sequence)
 {
     /* Without it a session that was recorded could be played back. */
     trust->able = hal_random(trust->challenge, EVLCP_CHALLENGE_BYTES);
@@ -32,13 +32,13 @@ void evlcp_trust_session(struct evlcp_trust *trust, uint16_t sequence)
 }
 
 /* A request's number goes on where its 16 bits in the header wrap, so that none of them comes twice. */
-static uint32_t number_of(const struct evlcp_trust *trust, uint16_t sequence)
+static uint32_t request_number(const struct evlcp_trust *trust, uint16_t sequence)
 {
     uint32_t ahead = (sequence - trust->newest) & 0xffffu;
     return trust->newest + ahead - (ahead >= 0x8000u ? 0x10000u : 0u);
 }
 
-static bool good(const struct evlcp_trust *trust, const struct evlcp_datagram *d, uint32_t number)
+static bool has_valid_seal(const struct evlcp_trust *trust, const struct evlcp_datagram *d, uint32_t number)
 {
     uint8_t head[8];
     uint8_t digest[EVLCP_SHA256_BYTES];
@@ -59,7 +59,7 @@ static bool good(const struct evlcp_trust *trust, const struct evlcp_datagram *d
     return differ == 0u;
 }
 
-enum evlcp_status evlcp_trust_open(struct evlcp_trust *trust, struct evlcp_datagram *datagram, bool *sealed)
+enum evlcp_status evlcp_trust_unseal(struct evlcp_trust *trust, struct evlcp_datagram *datagram, bool *sealed)
 {
     *sealed = false;
     if (datagram->status != EVLCP_SEALED)
@@ -67,8 +67,8 @@ enum evlcp_status evlcp_trust_open(struct evlcp_trust *trust, struct evlcp_datag
     if (datagram->length < EVLCP_SEAL_BYTES || !trust->able || !trust->locked)
         return EVLCP_STATUS_BAD_SEAL;
     datagram->length -= EVLCP_SEAL_BYTES;
-    uint32_t number = number_of(trust, datagram->sequence);
-    if (!good(trust, datagram, number))
+    uint32_t number = request_number(trust, datagram->sequence);
+    if (!has_valid_seal(trust, datagram, number))
         return EVLCP_STATUS_BAD_SEAL;
     if ((int32_t)(number - trust->newest) > 0)
         trust->newest = number;

@@ -17,15 +17,15 @@ struct evlcp_trust {
 };
 
 /* Set the key; all zeros is none. */
-void evlcp_trust_set(struct evlcp_trust *trust, const uint8_t key[EVLCP_KEY_BYTES]);
+void evlcp_trust_set_key(struct evlcp_trust *trust, const uint8_t key[EVLCP_KEY_BYTES]);
 
 /* First bytes of the key's SHA-256; zeros without a key. */
-void evlcp_trust_name(const struct evlcp_trust *trust, uint8_t name[EVLCP_KEY_NAME_BYTES]);
+void evlcp_trust_key_name(const struct evlcp_trust *trust, uint8_t name[EVLCP_KEY_NAME_BYTES]);
 
 /* A new session, whose HELLO had this sequence: draw its challenge. */
-void evlcp_trust_session(struct evlcp_trust *trust, uint16_t sequence);
+void evlcp_trust_begin_session(struct evlcp_trust *trust, uint16_t sequence);
 
-/* Take the seal off a request of the session; *sealed says whether it was a good one of the board's key. */
-enum evlcp_status evlcp_trust_open(struct evlcp_trust *trust, struct evlcp_datagram *datagram, bool *sealed);
+/* Remove the seal of a request of the session; *sealed: whether it had a valid one by the board's key. */
+enum evlcp_status evlcp_trust_unseal(struct evlcp_trust *trust, struct evlcp_datagram *datagram, bool *sealed);
 
 #endif

@@ -12,16 +12,16 @@
 #define TRIES_AT (SEAL_AT + 32u)
 #define CONFIRMED_AT (SEAL_AT + 48u)
 
-static uint32_t word(uint8_t image, uint32_t offset)
+static uint32_t read_word(uint8_t image, uint32_t offset)
 {
     uint8_t bytes[4];
     return hal_flash_read((uint8_t)(EVLCP_IMAGE_SLOT + image), offset, bytes, 4u) ? evlcp_get32(bytes) : 0u;
 }
 
-static bool clear(uint8_t image, uint32_t offset)
+static bool clear_word(uint8_t image, uint32_t offset)
 {
     static const uint8_t zero[4];
-    return hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + image), offset, zero, 4u) && word(image, offset) == 0u;
+    return hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + image), offset, zero, 4u) && read_word(image, offset) == 0u;
 }
 
 bool evlcp_flash_crc(uint8_t slot, uint32_t offset, uint32_t length, uint32_t *crc)
@@ -37,13 +37,13 @@ bool evlcp_flash_crc(uint8_t slot, uint32_t offset, uint32_t length, uint32_t *c
     return true;
 }
 
-static bool crc_of(uint8_t image, uint32_t length, uint32_t *crc)
+static bool image_crc(uint8_t image, uint32_t length, uint32_t *crc)
 {
     return evlcp_flash_crc((uint8_t)(EVLCP_IMAGE_SLOT + image), 0u, length, crc);
 }
 
-/* Whether a whole image stands in a place. */
-static bool sealed(uint8_t image, struct evlcp_image_seal *seal)
+/* Whether a place has a whole image. */
+static bool has_valid_image(uint8_t image, struct evlcp_image_seal *seal)
 {
     uint8_t b[EVLCP_IMAGE_SEAL_BYTES];
     uint32_t crc;
@@ -51,49 +51,50 @@ static bool sealed(uint8_t image, struct evlcp_image_seal *seal)
         return false;
     *seal = evlcp_image_seal_get(b);
     return seal->magic == MAGIC && seal->check == evlcp_crc32(0u, b, sizeof b - 4u) &&
-           seal->length <= EVLCP_IMAGE_BYTES && crc_of(image, seal->length, &crc) && crc == seal->crc;
+           seal->length <= EVLCP_IMAGE_BYTES && image_crc(image, seal->length, &crc) && crc == seal->crc;
 }
 
-static bool newer(uint32_t a, uint32_t b)
+static bool is_newer(uint32_t a, uint32_t b)
 {
     return (int32_t)(a - b) > 0;
 }
 
-static bool confirmed(uint8_t image)
+static bool is_confirmed(uint8_t image)
 {
-    return word(image, CONFIRMED_AT) == 0u;
+    return read_word(image, CONFIRMED_AT) == 0u;
 }
 
-/* A place that holds an image which runs, or would run. */
-static bool worth(uint8_t image, struct evlcp_image_seal *seal)
+/* Whether a place has an image that runs, or would run. */
+static bool is_bootable(uint8_t image, struct evlcp_image_seal *seal)
 {
-    return sealed(image, seal) && (confirmed(image) || word(image, TRIES_AT + 4u * (EVLCP_TRIES - 1u)) == ERASED);
+    return has_valid_image(image, seal) &&
+           (is_confirmed(image) || read_word(image, TRIES_AT + 4u * (EVLCP_TRIES - 1u)) == ERASED);
 }
 
-uint8_t evlcp_update_pick(void)
+uint8_t evlcp_update_pick_image(void)
 {
     struct evlcp_image_seal seals[EVLCP_IMAGES];
     bool valid[EVLCP_IMAGES];
     for (uint8_t i = 0; i < EVLCP_IMAGES; i++)
-        valid[i] = worth(i, &seals[i]);
-    uint8_t first = valid[1] && (!valid[0] || newer(seals[1].sequence, seals[0].sequence)) ? 1u : 0u;
+        valid[i] = is_bootable(i, &seals[i]);
+    uint8_t first = valid[1] && (!valid[0] || is_newer(seals[1].sequence, seals[0].sequence)) ? 1u : 0u;
     for (uint8_t turn = 0; turn < EVLCP_IMAGES; turn++) {
         uint8_t i = turn == 0u ? first : (uint8_t)(1u - first);
         if (!valid[i])
             continue;
-        if (confirmed(i))
+        if (is_confirmed(i))
             return (uint8_t)(i + 1u);
         for (uint32_t n = 0; n < EVLCP_TRIES; n++) {
             uint32_t at = TRIES_AT + 4u * n;
             /* A try that cannot be counted is not made. */
-            if (word(i, at) == ERASED && clear(i, at))
+            if (read_word(i, at) == ERASED && clear_word(i, at))
                 return (uint8_t)(i + 1u);
         }
     }
     return 0u;
 }
 
-/* The place that an update goes to: not the one that runs, else one that is empty, else the older. */
+/* The place for an update: not the running one, else an empty one, else the older. */
 static uint8_t next_image(uint32_t *newest)
 {
     struct evlcp_image_seal seals[EVLCP_IMAGES];
@@ -101,25 +102,25 @@ static uint8_t next_image(uint32_t *newest)
     uint8_t running = hal_running();
     *newest = 0u;
     for (uint8_t i = 0; i < EVLCP_IMAGES; i++) {
-        valid[i] = sealed(i, &seals[i]);
-        if (valid[i] && (*newest == 0u || newer(seals[i].sequence, *newest)))
+        valid[i] = has_valid_image(i, &seals[i]);
+        if (valid[i] && (*newest == 0u || is_newer(seals[i].sequence, *newest)))
             *newest = seals[i].sequence;
     }
     if (running != 0u)
         return running == 1u ? 1u : 0u;
-    return valid[0] && (!valid[1] || newer(seals[0].sequence, seals[1].sequence)) ? 1u : 0u;
+    return valid[0] && (!valid[1] || is_newer(seals[0].sequence, seals[1].sequence)) ? 1u : 0u;
 }
 
-static bool on_trial(void)
+static bool is_on_trial(void)
 {
     uint8_t running = hal_running();
-    return running != 0u && !confirmed((uint8_t)(running - 1u));
+    return running != 0u && !is_confirmed((uint8_t)(running - 1u));
 }
 
-void evlcp_update_tell(struct evlcp_update_status_reply *reply)
+void evlcp_update_fill_status(struct evlcp_update_status_reply *reply)
 {
     reply->running = hal_running();
-    reply->trial = on_trial() ? 1u : 0u;
+    reply->trial = is_on_trial() ? 1u : 0u;
     reply->next = (uint8_t)(next_image(&reply->sequence) + 1u);
     reply->capacity = EVLCP_IMAGE_BYTES;
 }
@@ -129,7 +130,7 @@ enum evlcp_status evlcp_update_begin(struct evlcp_update *u, const struct evlcp_
 {
     uint32_t newest;
     uint8_t image = next_image(&newest);
-    if (on_trial()) /* the image before it must stay until this one has proven itself */
+    if (is_on_trial()) /* the image before it must stay until this one has proven itself */
         return EVLCP_STATUS_BUSY;
     if (request->image != image + 1u)
         return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, image + 1u);
@@ -159,7 +160,7 @@ enum evlcp_status evlcp_update_commit(struct evlcp_update *u, uint32_t *sequence
     uint8_t b[EVLCP_IMAGE_SEAL_BYTES];
     if (!u->open)
         return EVLCP_STATUS_NOTHING_COMMITTED;
-    if (!crc_of(u->image, u->length, detail))
+    if (!image_crc(u->image, u->length, detail))
         return EVLCP_STATUS_FLASH_FAULT;
     if (*detail != u->crc)
         return EVLCP_STATUS_BAD_CRC;
@@ -169,7 +170,8 @@ enum evlcp_status evlcp_update_commit(struct evlcp_update *u, uint32_t *sequence
     struct evlcp_image_seal seal = {.magic = MAGIC, .sequence = *sequence, .length = u->length, .crc = u->crc};
     (void)evlcp_image_seal_put(b, &seal);
     evlcp_put32(b + sizeof b - 4u, evlcp_crc32(0u, b, sizeof b - 4u));
-    if (!hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + u->image), SEAL_AT, b, sizeof b) || !sealed(u->image, &seal))
+    if (!hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + u->image), SEAL_AT, b, sizeof b) ||
+        !has_valid_image(u->image, &seal))
         return EVLCP_STATUS_FLASH_FAULT;
     return EVLCP_STATUS_OK;
 }
@@ -177,7 +179,7 @@ enum evlcp_status evlcp_update_commit(struct evlcp_update *u, uint32_t *sequence
 enum evlcp_status evlcp_update_confirm(void)
 {
     uint8_t running = hal_running();
-    if (!on_trial())
+    if (!is_on_trial())
         return EVLCP_STATUS_OK;
-    return clear((uint8_t)(running - 1u), CONFIRMED_AT) ? EVLCP_STATUS_OK : EVLCP_STATUS_FLASH_FAULT;
+    return clear_word((uint8_t)(running - 1u), CONFIRMED_AT) ? EVLCP_STATUS_OK : EVLCP_STATUS_FLASH_FAULT;
 }

@@ -28,10 +28,10 @@ bool evlcp_flash_crc(uint8_t slot, uint32_t offset, uint32_t length, uint32_t *c
 
 /* Which image to run after a reset, 1 or 2, or 0 for the one that was flashed; a trial's count goes down. Called
    once, before anything else, by the image that was flashed. */
-uint8_t evlcp_update_pick(void);
+uint8_t evlcp_update_pick_image(void);
 
-/* What UPDATE_STATUS tells, but the target. */
-void evlcp_update_tell(struct evlcp_update_status_reply *reply);
+/* Fill the reply to UPDATE_STATUS, but for the target. */
+void evlcp_update_fill_status(struct evlcp_update_status_reply *reply);
 
 /* Requests, with the LEDs dark. */
 enum evlcp_status evlcp_update_begin(struct evlcp_update *u, const struct evlcp_update_begin_request *request,

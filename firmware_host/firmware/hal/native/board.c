@@ -211,7 +211,7 @@ void board_reset(struct native *board)
     board->waits = false;
     board->in_step = false;
     memset(&board->core, 0, sizeof board->core);
-    board->bench.running = evlcp_update_pick();
+    board->bench.running = evlcp_update_pick_image();
     evlcp_init(&board->core);
 }
 
@@ -255,7 +255,7 @@ void board_run_us(struct native *board, uint64_t us)
     uint64_t until = board->now + us * (NATIVE_TICK_HZ / 1000000u);
     self = board;
     serve(board);
-    /* A START that waits is looked at often enough to begin in time. */
+    /* A START that waits is checked often enough to begin in time. */
     while (board->period == 0u && board->core.start.waiting && board->now + WAIT_TICKS < until) {
         board->now += WAIT_TICKS;
         pulses(board);

@@ -249,7 +249,7 @@ static volatile uint32_t draining; /* chips until the chain is at rest after the
 static volatile uint32_t served;   /* chip interrupts since the start, up to 2 */
 static bool overrun;               /* the chip interrupt missed a row */
 static volatile bool streaming;    /* TIM1 and the stream are to run */
-static volatile bool failed;       /* went dark by itself; the core is yet to be told */
+static volatile bool failed;       /* went dark by itself; yet to be reported to the core */
 /* Where chips should be, in counts of TIM2: `step_chip` begins at `step_at`, a chip takes `step_counts` / 65536. The
    main loop writes it with `step_on` false. */
 static volatile bool step_on;
@@ -268,7 +268,7 @@ static uint32_t last_count;
 static uint32_t count_rest;
 static uint32_t millis;
 static volatile uint32_t lost;
-static uint32_t lost_told;
+static uint32_t reported_lost;
 
 void hal_info(struct evlcp_hal_info *info)
 {
@@ -338,7 +338,7 @@ static void chips_stop(void)
     draining = 0u;
 }
 
-static void fail(void)
+static void report_chip_fault(void)
 {
     failed = true;
     chips_stop();
@@ -363,30 +363,30 @@ static bool shift_now(void)
     return true;
 }
 
-/* Something that should go on all the time, as the main loop sees it. */
-struct look {
+/* Progress of something that must not stop, as the main loop checks it. */
+struct progress {
     uint32_t good_at;
     uint32_t bad;
 };
 
-static bool stands(struct look *look, bool good, uint32_t now, uint32_t most)
+static bool has_stalled(struct progress *progress, bool good, uint32_t now, uint32_t most)
 {
-    if (good || look->bad == 0u) {
-        look->good_at = now;
-        look->bad = good ? 0u : 1u;
+    if (good || progress->bad == 0u) {
+        progress->good_at = now;
+        progress->bad = good ? 0u : 1u;
         return false;
     }
-    look->bad++;
-    return look->bad > LOOKS_MIN && now - look->good_at > most;
+    progress->bad++;
+    return progress->bad > LOOKS_MIN && now - progress->good_at > most;
 }
 
-static struct look spi_look;
-static struct look latch_look;
+static struct progress spi_progress;
+static struct progress latch_progress;
 static uint32_t latch_count;
 static bool latch_seen; /* it has counted since the start */
 
 /* Called without pause while chips may run. */
-static void watch_chips(void)
+static void check_chip_progress(void)
 {
     uint32_t at = chip_at; /* before the count: a chip in between makes it no older */
     uint32_t now = TIM_CNT(TIM2);
@@ -394,26 +394,27 @@ static void watch_chips(void)
     if (!streaming)
         return;
     bool bad = now - at > most;
-    bad |= stands(&spi_look, (SPI_SR & (SPI_EMPTY | SPI_BUSY)) == SPI_EMPTY && (SPI_CR1 & SPI_ON) != 0u, now, most);
+    bool spi_moves = (SPI_SR & (SPI_EMPTY | SPI_BUSY)) == SPI_EMPTY && (SPI_CR1 & SPI_ON) != 0u;
+    bad |= has_stalled(&spi_progress, spi_moves, now, most);
     uint32_t count = TIM_CNT(TIM3);
     latch_seen |= count != latch_count;
-    bad |= stands(&latch_look, count != latch_count || !latch_seen, now, most);
+    bad |= has_stalled(&latch_progress, count != latch_count || !latch_seen, now, most);
     latch_count = count;
     if (bad && streaming) /* it may have ended meanwhile */
-        fail();
+        report_chip_fault();
 }
 
 /* Wait until the rows that the core has ended with have left the chain: at most three chips. */
-static void rest(void)
+static void wait_until_drained(void)
 {
     while (draining != 0u)
-        watch_chips();
+        check_chip_progress();
 }
 
 void hal_leds(const uint8_t *row, uint32_t chip)
 {
     if (chip == EVLCP_CHIP_TEST)
-        rest();
+        wait_until_drained();
     if (chip == EVLCP_CHIP_DARK && !in_chip) {
         outputs_off();
         return;
@@ -423,12 +424,12 @@ void hal_leds(const uint8_t *row, uint32_t chip)
         if (shift_now())
             outputs_on();
         else
-            fail();
+            report_chip_fault();
     }
 }
 
-/* Lay down where chips should be, from the latest pulse. */
-static void step_set(void)
+/* Plan the times of chips from the latest pulse. */
+static void plan_steps(void)
 {
     uint32_t each = when.chip_rate_hz / when.pulse_hz;
     step_on = false;
@@ -439,12 +440,12 @@ static void step_set(void)
 }
 
 /* In the chip interrupt: stop TIM1 for as long as this chip is early. */
-static void step(void)
+static void step_chip_clock(void)
 {
     step_served++;
     uint32_t slot = (2u * SLOTS_PER_CHIP - DMA_S5NDTR) % SLOTS_PER_CHIP;
     if (!step_on || slot != 0u)
-        return; /* laid down anew, or so late that the place is unsure: the next one does it */
+        return; /* planned anew, or so late that the place is unsure: the next one does it */
     int64_t chips = (int64_t)(int32_t)(step_served - step_chip);
     uint32_t should = step_at + (uint32_t)(int32_t)(chips * (int64_t)step_counts >> 16);
     int32_t early = (int32_t)(should + TIM_CNT(TIM1) / 2u - TIM_CNT(TIM2));
@@ -509,8 +510,8 @@ static void chips_start(uint32_t ticks)
 
     SYSTICK_RVR = SLOTS_PER_CHIP * slot_cycles * 3u / 2u - 1u;
     SYSTICK_CVR = 0u;
-    spi_look.bad = 0u;
-    latch_look.bad = 0u;
+    spi_progress.bad = 0u;
+    latch_progress.bad = 0u;
     latch_seen = false;
     latch_count = TIM_CNT(TIM3);
     step_served = 0u;
@@ -525,7 +526,7 @@ static void chips_start(uint32_t ticks)
     SYSTICK_CSR = SYSTICK_ON;
     TIM_CR1(TIM1) = 1u;
     if (in_step)
-        step_set();
+        plan_steps();
 }
 
 void hal_chips(uint32_t ticks)
@@ -539,7 +540,7 @@ void hal_chips(uint32_t ticks)
         chips_stop();
         return;
     }
-    rest();
+    wait_until_drained();
     if (!failed)
         chips_start(ticks);
 }
@@ -575,14 +576,14 @@ static void take_pulse(uint32_t at)
     pulse.count += periods;
     pulse.at = at;
     if (in_step)
-        step_set();
+        plan_steps();
 }
 
-bool hal_pulse(struct evlcp_pulse *told)
+bool hal_pulse(struct evlcp_pulse *found)
 {
     if ((TIM_SR(TIM2) & TIM_CAPTURED) != 0u)
         take_pulse(TIM_CCR1(TIM2)); /* the read clears the flag */
-    *told = pulse;
+    *found = pulse;
     if (in_step && TIM_CNT(TIM2) - pulse.at > CORE_HZ / 2u / when.pulse_hz * 3u / 2u)
         pulse_fits = false;
     return !in_step || pulse_fits;
@@ -635,8 +636,8 @@ bool hal_random(uint8_t *bytes, uint32_t count)
 uint32_t hal_lost(void)
 {
     uint32_t total = lost;
-    uint32_t since = total - lost_told;
-    lost_told = total;
+    uint32_t since = total - reported_lost;
+    reported_lost = total;
     return since;
 }
 
@@ -692,7 +693,7 @@ static void flash_forget(void)
 
 bool hal_flash_erase(uint8_t slot)
 {
-    rest(); /* the core stands while a sector is erased, and no chip may come then */
+    wait_until_drained(); /* the core stands while a sector is erased, and no chip may come then */
     iwdg_reload(IWDG_LONG);
     flash_unlock();
     FLASH_CR = FLASH_WORDS | FLASH_SECTOR_ERASE | SLOT_SECTOR(slot) << 3;
@@ -743,7 +744,7 @@ void hal_restart(void)
 /* The image that was flashed hands over to an update. The watchdog runs before: an update that hangs is left. */
 static void hand_over(void)
 {
-    uint8_t image = EVLCP_IMAGE == 0u ? evlcp_update_pick() : 0u;
+    uint8_t image = EVLCP_IMAGE == 0u ? evlcp_update_pick_image() : 0u;
     if (image == 0u)
         return;
     IWDG_KR = IWDG_START;
@@ -764,7 +765,7 @@ static void fault_handler(void)
 static void silence_handler(void)
 {
     if (streaming)
-        fail();
+        report_chip_fault();
 }
 
 /* Clock security: the crystal has stopped, and the core runs on the 16 MHz RC oscillator. */
@@ -773,7 +774,7 @@ static void clock_handler(void)
     outputs_off();
     RCC_CIR |= CLOCK_SECURITY_CLEAR;
     clock_failed = true;
-    fail();
+    report_chip_fault();
     RCC_CFGR = 0u; /* buses undivided: the host's line rate can be kept */
     USART_BRR = HSI_HZ / EVLCP_BAUD;
     IWDG_KR = IWDG_UNLOCK;
@@ -783,7 +784,7 @@ static void clock_handler(void)
 static void supply_handler(void)
 {
     EXTI_PR = EXTI_PVD;
-    fail();
+    report_chip_fault();
 }
 
 static void chip_handler(void)
@@ -796,7 +797,7 @@ static void chip_handler(void)
     if (!streaming) /* chips_stop was under way */
         return;
     if ((flags & DMA_S5_ERRORS) != 0u || (DMA_S5CR & DMA_ENABLE) == 0u) {
-        fail();
+        report_chip_fault();
         return;
     }
     gone = flags == DMA_S5_HALF ? 0u : 1u;
@@ -807,7 +808,7 @@ static void chip_handler(void)
     if (served < 2u)
         served++;
     if (in_step)
-        step();
+        step_chip_clock();
     if (draining != 0u) {
         if (draining == 1u) {
             outputs_off();
@@ -835,7 +836,7 @@ static void receive_handler(void)
     }
 }
 
-static bool ready(const volatile uint32_t *where, uint32_t mask, uint32_t value)
+static bool wait_for_bits(const volatile uint32_t *where, uint32_t mask, uint32_t value)
 {
     for (uint32_t n = 0; n < WAIT_LOOPS; n++) {
         if ((*where & mask) == value)
@@ -849,16 +850,16 @@ static bool ready(const volatile uint32_t *where, uint32_t mask, uint32_t value)
 static bool clock_start(void)
 {
     RCC_CR |= HSE_ON;
-    if (!ready(&RCC_CR, HSE_READY, HSE_READY))
+    if (!wait_for_bits(&RCC_CR, HSE_READY, HSE_READY))
         return false;
     FLASH_ACR = FLASH_CACHES | FLASH_PREFETCH | FLASH_LATENCY_5;
     RCC_PLLCFGR = 7u << 24 | 1u << 22 | 336u << 6 | EVLCP_HSE_HZ / 1000000u;
     RCC_CR |= PLL_ON;
-    if (!ready(&RCC_CR, PLL_READY, PLL_READY))
+    if (!wait_for_bits(&RCC_CR, PLL_READY, PLL_READY))
         return false;
     RCC_CFGR = 5u << 10 | 4u << 13; /* APB1 by 4, APB2 by 2 */
     RCC_CFGR |= 2u;
-    if (!ready(&RCC_CFGR, 0xcu, 8u))
+    if (!wait_for_bits(&RCC_CFGR, 0xcu, 8u))
         return false;
     RCC_CR |= CLOCK_SECURITY_ON;
     return true;
@@ -908,7 +909,7 @@ int main(void)
     EXTI_RTSR = EXTI_PVD; /* rising: the supply falls */
     evlcp_init(&board);
     if (by_watchdog)
-        evlcp_failed(&board);
+        evlcp_hardware_failed(&board);
     EXTI_PR = EXTI_PVD;
     EXTI_IMR = EXTI_PVD;
     /* SysTick and PVD are the highest, to get through a chip interrupt that hangs. A byte waits for 10 us, a row
@@ -920,10 +921,10 @@ int main(void)
     USART_CR1 = 1u << 13 | 1u << 5 | 1u << 3 | 1u << 2; /* on, receive interrupt, transmitter, receiver */
     for (;;) {
         evlcp_poll(&board);
-        watch_chips();
+        check_chip_progress();
         if (failed) {
             failed = false;
-            evlcp_failed(&board);
+            evlcp_hardware_failed(&board);
         }
         IWDG_KR = IWDG_FEED;
     }
