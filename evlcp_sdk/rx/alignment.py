@@ -88,7 +88,7 @@ class AlignedFrame(NamedTuple):
 
     Attributes:
         pilot: The newest pilot, its own if it has one.
-        sums_and_next: Polarity sums of pilot and info segment, and of the chips after the frame
+        sums_and_trailing: Polarity sums of pilot and info segment, and of the chips after the frame
             (`Codebook.trailing_chips`), int16 (chips, height, width).
         offset_px: The rest of the motion in pilot and info segment, float64 (2, chips), px.
         corner_px: Column and row on the sensor of the image's pixel (0, 0) in the chip that starts at
@@ -98,7 +98,7 @@ class AlignedFrame(NamedTuple):
     """
 
     pilot: Pilot
-    sums_and_next: NDArray[np.int16]
+    sums_and_trailing: NDArray[np.int16]
     offset_px: NDArray[np.float64]
     corner_px: tuple[float, float]
     middle_us: float
@@ -106,7 +106,7 @@ class AlignedFrame(NamedTuple):
     @property
     def sums(self) -> NDArray[np.int16]:
         """Polarity sums of pilot and info segment, int16 (chips, height, width)."""
-        return self.sums_and_next[: self.offset_px.shape[1]]
+        return self.sums_and_trailing[: self.offset_px.shape[1]]
 
     @property
     def centre_px(self) -> tuple[float, float]:
@@ -240,7 +240,7 @@ class FrameAligner:
         cut = (x < right_px) | (x > width - 1 - right_px) | (y < down_px) | (y > height - 1 - down_px)
         return drop_clusters(presence, cut) if cut.any() else presence
 
-    def light_rows(self, aligned: AlignedFrame) -> tuple[float, float] | None:
+    def visible_rows(self, aligned: AlignedFrame) -> tuple[float, float] | None:
         """Upper and lower edge of the clusters that a frame shows, from the whole bar's centre, px.
 
         None where it shows both ends.

@@ -134,7 +134,7 @@ class PendingFrame:
     frame: Frame | None
 
 
-class PacketFraming(Framer):
+class PacketFramer(Framer):
     """Finds the packets of a stream's regions, decodes their frames, and corrects the regions by them.
 
     `follower` is `regions` again where frames correct them; None where they stay as a detector has them.
@@ -291,7 +291,7 @@ class PacketFraming(Framer):
             self.counts["regions_opened"] += 1
             with guard:
                 state = self._synchronizer.init()
-            transmitter = self._transmitters.open(region, state, self._decoder.init_state())
+            transmitter = self._transmitters.add(region, state, self._decoder.init_state())
         for start_us, events in pieces:
             self.counts["events_in_regions"] += events.t_us.size
             until_us = min(start_us + self._step_us, step.end_us)
@@ -621,7 +621,7 @@ class PacketFraming(Framer):
         return True
 
     def _unite_parts(self, transmitter: Transmitter) -> bool:
-        parts = self._transmitters.find_in_step(transmitter)
+        parts = self._transmitters.find_synchronous(transmitter)
         if self._follower is None or transmitter.region.id in self._dropped or not parts:
             return False
         for part in parts:

@@ -47,7 +47,7 @@ class _DeframedRegion:
     last: tuple[int, int] = (-1, -1)
 
 
-class PluginFraming(Framer):
+class PluginFramer(Framer):
     """Decodes the regions of a stream by a plugin's framing."""
 
     drops_cut_frames = False

@@ -267,7 +267,7 @@ class FrameReader:
         distance is measured if it is `ranged`.
         """
         sums, presence, placement = aligned.sums, aligned.pilot.presence, aligned.pilot.placement
-        soft = self._steps.decode(presence, aligned.sums_and_next, last_chips, self._behind[due.index])
+        soft = self._steps.decode(presence, aligned.sums_and_trailing, last_chips, self._behind[due.index])
         lit, images = np.empty_like(placement.seen), (sums, presence.probability, presence.grid_px)
         # In a gap of the stream, or behind a passing pole, silence is no symbol.
         outside, darkest, brightest = _kernels.find_lit_clusters(
@@ -358,7 +358,7 @@ class FrameDecoder:
         box = aligner.bar_box(aligned, pilot.placement)
         others = tuple(aligner.bar_box(aligned, other) for other in pilot.others)
         return BarPlace(
-            aligned.middle_us, *box, aligner.light_rows(aligned), aligner.light_strips(aligned), others
+            aligned.middle_us, *box, aligner.visible_rows(aligned), aligner.light_strips(aligned), others
         )
 
     def read(

@@ -14,12 +14,12 @@ from evlcp_sdk.link.several import name_links
 from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx.detected import DetectorTracker
 from evlcp_sdk.rx.framer import SILENT, Announcer, Framer, StreamContext, to_camera_time
-from evlcp_sdk.rx.framing import PacketFraming
+from evlcp_sdk.rx.framing import PacketFramer
 from evlcp_sdk.rx.guard import compile_tracker
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.multi import FrameReporter, LinkArbiter, share_detectors
-from evlcp_sdk.rx.plugin_framing import PluginFraming
+from evlcp_sdk.rx.plugin_framing import PluginFramer
 from evlcp_sdk.rx.reading import FrameDecoder
 from evlcp_sdk.rx.reflections import ReflectionQueue, Reflections
 from evlcp_sdk.rx.regions import RegionTracker, RhythmTracker, is_same_place
@@ -281,11 +281,11 @@ class LinkReceiver:
         self.framing: Framer
         if link.algorithm("framing").roles >= STEPS:
             decoder = FrameDecoder(link, self._announcer)
-            self.framing = PacketFraming(
+            self.framing = PacketFramer(
                 link, name, stream, decoder, self._tracker, rhythm_tracker, self._queue, on_frame
             )
         else:
-            self.framing = PluginFraming(link, name, stream, self._queue, on_frame)
+            self.framing = PluginFramer(link, name, stream, self._queue, on_frame)
         self._messages = MessageAssembler.of(link, stream.clock_zero)
         self._packet_counts = {"frames_reflected": 0, "frames_alike": 0, "packets": 0}
         self._frames_of_others = self._misses_of_others = 0

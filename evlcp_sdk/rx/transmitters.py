@@ -116,11 +116,11 @@ class PacketGrid:
 
     def go_to(self, frame: int) -> None:
         """Set the next frame, and its times by the newest lock."""
-        lock, form = self.lock, self.format
+        lock, lengths = self.lock, self.format
         assert lock is not None
         self.frame, start_us = frame, self.start_us(frame)
-        packet, index = divmod(frame, form.frames)
-        begin, end = form.frame_starts[index : index + 2]
+        packet, index = divmod(frame, lengths.frames)
+        begin, end = lengths.frame_starts[index : index + 2]
         late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
         end_us = start_us + (end - begin) * lock.chip_us + late_us
         self.next = DueFrame(
@@ -128,19 +128,19 @@ class PacketGrid:
             packet=packet,
             index=index,
             chips=end - begin,
-            has_pilot=end - begin > form.info_chips,
+            has_pilot=end - begin > lengths.info_chips,
             packet_us=start_us - begin * lock.chip_us,
             start_us=start_us,
             end_us=end_us,
             lock=lock,
             read_us=end_us + self.trailing_chips * lock.chip_us,
-            middle_us=float(start_us) + min(end - begin, form.pilot_chips) // 2 * float(lock.chip_us),
+            middle_us=float(start_us) + min(end - begin, lengths.pilot_chips) // 2 * float(lock.chip_us),
         )
 
     def next_due(self, until_us: float) -> DueFrame | None:
         """The next frame, if all that is read with it lies before a time."""
-        known = self.next
-        return known if known is not None and known.read_us <= until_us else None
+        due = self.next
+        return due if due is not None and due.read_us <= until_us else None
 
 
 @dataclass(frozen=True)
@@ -287,7 +287,7 @@ class Transmitters:
         self._released: list[Transmitter] = []
         self._numbers = numbers
 
-    def open(self, region: TrackedRegion, sync: Any, state: BarState) -> Transmitter:
+    def add(self, region: TrackedRegion, sync: Any, state: BarState) -> Transmitter:
         """Add a new region, with the first states of its synchronization and its frames."""
         assembler = PacketAssembler(self._packet.frames)
         transmitter = Transmitter(region, sync, state, assembler, self._new_grid())
@@ -313,7 +313,7 @@ class Transmitters:
         oldest_us = region.pieces[0][0] if region.pieces else 0
         region.first_us = max(region.first_us, oldest_us, int(old.grid.start_us(old.last_confirmed + 1)))
         # The LEDs may be the same: the place of the bar and its distance go on.
-        new = self.open(region, old.sync, old.fetch_state()._replace(frame=-1, pilot=None))
+        new = self.add(region, old.sync, old.fetch_state()._replace(frame=-1, pilot=None))
         new.row_delay = old.row_delay
         return new
 
@@ -343,7 +343,7 @@ class Transmitters:
     def _new_grid(self) -> PacketGrid:
         return PacketGrid(self._packet, self._trailing_chips)
 
-    def find_in_step(self, transmitter: Transmitter) -> list[Transmitter]:
+    def find_synchronous(self, transmitter: Transmitter) -> list[Transmitter]:
         """Find others without a frame so far whose packets are at the found times.
 
         They are parts of one bar, or a bar and its image: of two bars, 3 % of pairs would be in step.

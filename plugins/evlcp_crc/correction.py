@@ -28,11 +28,11 @@ class NoCorrection(ErrorCorrection):
             raise ConfigError(
                 f"error-correction 'none': a block of {coded_bits} bits, expected at least {CRC_BITS + 8}"
             )
-        return _Checked(message_bits, coded_bits)
+        return _CrcCode(message_bits, coded_bits)
 
 
 @dataclass(frozen=True)
-class _Checked:
+class _CrcCode:
     message_bits: int
     coded_bits: int
 

@@ -244,7 +244,7 @@ def read_rows(sums: Array, line: Array, clusters: int, out: Array) -> None:
 
 
 @njit
-def measure_dim(sums: Array, pilots: Array, seen: Array, line: Array) -> float:
+def measure_polarity_ratio(sums: Array, pilots: Array, seen: Array, line: Array) -> float:
     """How often pixels in clusters' middles answer steps down, as a share of how often they answer steps up.
 
     A camera may miss more events of one polarity, and boundaries then show values of that sign smaller. The
@@ -354,7 +354,7 @@ def _model_levels(
             shift = fit[5] * column[_SIDE + j] + fit[6] * column[_REPEAT + j]
             at = fit[1] + fit[2] * column[_TIME + j] + fit[0] * column[_PLACE + j] + shift
             work[_AT + j] = column[_FIRST + j] - at
-    width, dim = lens[0] * exp(fit[4]), lens[1]
+    width, negative_share = lens[0] * exp(fit[4]), lens[1]
     scale, steepest = (profile.shape[1] - 1) / (PROFILE_REACH * width), fit[3] / width
     most = profile.shape[1] - 1 - 1e-9
     which = np.empty(_BLOCK, np.int32)
@@ -372,9 +372,9 @@ def _model_levels(
         step = column[_STEP + j]
         # Codes are 1 and -1, and differ: their mean is 0.
         level = (step if work[_AT + j] + row > 0 else -step) * work[_LEVEL + j]
-        less = dim if level < 0 else 1.0
-        work[_LEVEL + j] = level * less
-        work[_STEEP + j] = -steepest * step * work[_STEEP + j] * less
+        factor = negative_share if level < 0 else 1.0
+        work[_LEVEL + j] = level * factor
+        work[_STEEP + j] = -steepest * step * work[_STEEP + j] * factor
 
 
 @njit

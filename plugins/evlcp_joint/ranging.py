@@ -116,7 +116,7 @@ class JointScaleRanging(Ranging):
             height, (first, spacing, _, tilt, _) = sums.shape[1], line.tolist()
             values = np.empty((n, height))
             _kernels.read_rows(sums, line, clusters, values)
-            dim = _kernels.measure_dim(sums, pilots, seen, line)
+            lens = self.blur_px, _kernels.measure_polarity_ratio(sums, pilots, seen, line)
             if spacing < 0:
                 # A bar upside down is mirrored.
                 spacing, first = -spacing, height - 1 - first
@@ -125,7 +125,7 @@ class JointScaleRanging(Ranging):
             centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
             fit = np.array([spacing, centre, 0.0, _START_GAIN, 0.0, 0.0, 0.0])
             (variance, seen_boundaries, wider_px), by_boundary = _kernels.fit_bar(
-                decoded, offset_px, values, boundary_profile(_CORE_SHARE), (self.blur_px, dim), least, fit
+                decoded, offset_px, values, boundary_profile(_CORE_SHARE), lens, least, fit
             )
             spacing_px, centre_px, *_ = fit.tolist()
             # From the start, by cells, an end moves by the size of a cell and a pixel of blur at most.

@@ -100,7 +100,7 @@ class PocRanging(Ranging):
             # The outermost are those of the clusters that are seen.
             selected = np.arange(bar.clusters)
         all_count = bool(self.clusters) or self.skip_outer == 0
-        skip = self._skipped_at_ends(bar.clusters) if bar.is_even_line and not all_count else 0
+        skip = self._clusters_to_skip(bar.clusters) if bar.is_even_line and not all_count else 0
         centres = bar.cluster_centres_m()
         a, b = np.triu_indices(len(selected), 1)
         if not all_count:
@@ -160,12 +160,12 @@ class PocRanging(Ranging):
 
         return measure
 
-    def _skipped_at_ends(self, clusters: int) -> int:
+    def _clusters_to_skip(self, clusters: int) -> int:
         """Clusters left out at each end: of three or fewer, none could be."""
         return self.skip_outer if clusters > 3 else 0
 
     def _select_clusters(self, clusters: int) -> NDArray[np.int64]:
-        skip = self._skipped_at_ends(clusters)
+        skip = self._clusters_to_skip(clusters)
         selected = np.array(self.clusters or range(skip, clusters - skip), np.int64)
         if clusters < 2:
             raise ConfigError(

@@ -172,10 +172,10 @@ def discrepancy_limit(weight: NDArray[np.float64], log_share: float) -> float:
     return -1.0
 
 
-def transform(bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def polar_transform(bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Bits times the Kronecker power of [[1, 0], [1, 1]], uint8 (N,); its own inverse.
 
-    >>> transform(np.array([0, 0, 0, 1], np.uint8)).tolist()
+    >>> polar_transform(np.array([0, 0, 0, 1], np.uint8)).tolist()
     [1, 1, 1, 1]
     """
     out, half = bits.copy(), 1
@@ -244,7 +244,7 @@ class _PolarCode:
         for word, message in enumerate(bits.reshape(self.words, -1)):
             code = np.zeros(len(self.information), np.uint8)
             code[self.information] = np.concatenate([message, crc24(message)])
-            coded[word * self.length : (word + 1) * self.length] = transform(code)[self.sent]
+            coded[word * self.length : (word + 1) * self.length] = polar_transform(code)[self.sent]
         return coded
 
     def decode(self, llr: NDArray[np.float32]) -> Corrected:
@@ -284,7 +284,7 @@ class _PolarCode:
             found = _kernels.list_decode(mother, self.nodes, size, most, codewords, metric)
             for path in np.argsort(metric[:found], kind="stable"):
                 if metric[path] <= limit:
-                    inputs = transform(codewords[path])[self.information]
+                    inputs = polar_transform(codewords[path])[self.information]
                     if not crc24(inputs).any():
                         return codewords[path], inputs, True
                 if metric[path] < least:
@@ -292,4 +292,4 @@ class _PolarCode:
             # A longer list would most likely find nothing nearer.
             if limit < 0 or found == 0:
                 break
-        return guess, transform(guess)[self.information], False
+        return guess, polar_transform(guess)[self.information], False
