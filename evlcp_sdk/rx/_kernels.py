@@ -1641,13 +1641,8 @@ def estimate_foreshortening(
     (along, across) of the axis, looks sqrt(1 - sine^2 (1 + across^2)) + along sine times as long: cos(tilt)
     in the middle of the image, elsewhere about `along` times the tilt more or less, which is of first order.
 
-    Args:
-        sine: Sines of tilts, float64 (n,).
-        likely: Prior of each, float64 (n,).
-        seen: The sine that was measured, NaN for none.
-        sigma: Its standard deviation.
-        along: Of the line of sight.
-        across: Of the line of sight.
+    `sine` (n,) are sines of tilts, `likely` (n,) their priors; `seen` with `sigma` is the one measured, or
+    NaN.
     """
     chance = likely
     if not np.isnan(seen):

@@ -153,13 +153,7 @@ class FrameAligner:
         )
 
     def align(self, region: TrackedRegion, due: DueFrame, pilot: Pilot | None) -> AlignedFrame | None:
-        """Hold a frame's image still and find its clusters; None if it does not show them.
-
-        Args:
-            region: The bar's.
-            due: Which frame.
-            pilot: The newest of the bar.
-        """
+        """Hold a frame's image still and find its clusters, by the newest pilot; None if it shows none."""
         lock, packet = due.lock, self._packet
         start_us, chip_us = float(due.start_us), float(lock.chip_us)
         centre_px = region.track.centres_at(self._chip_middles[: due.chips + self._after], start_us, chip_us)
@@ -214,9 +208,7 @@ class FrameAligner:
     ) -> tuple[tuple[float, float], tuple[float, float]]:
         """Centre (column, row) and (width, height) of a whole bar on the sensor, hidden parts too, px.
 
-        Args:
-            aligned: A frame.
-            placement: The bar's own or that of another instance, taken to be as wide.
+        `placement` is the bar's own or that of another instance, taken to be as wide.
         """
         places, right_px, down_px = self._cluster_extents(aligned, placement)
         columns, rows = places.real.tolist(), places.imag.tolist()
@@ -314,16 +306,13 @@ def polarity_sums(
 ) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
     """Sum polarities (+1, -1) by chip and pixel, with the bar held still to within half a pixel.
 
+    `events` are pieces of the stream that hold the chips, the first of which begins at `start_us`, with the
+    chip length and delays of `lock`; `centre_px` is column and row of the bar's centre in each, float64 (2,
+    chips); `size_px` is (width, height) of the image.
+
     Returns:
         The sums, int16 (chips, height, width); and the rest of the motion, (right, down) of the bar's centre
         from the middle of the image in each chip, float64 (2, chips), px.
-
-    Args:
-        events: Pieces of the stream that hold the chips; events outside them are ignored.
-        lock: Length of a chip, and the delays of positive and negative events, and by row.
-        start_us: Start of the first chip, us.
-        centre_px: Column and row of the bar's centre in each chip, float64 (2, chips), px.
-        size_px: (width, height) of the image, px.
     """
     width, height = size_px
     chips = centre_px.shape[1]

@@ -200,11 +200,8 @@ def fit_straight(place: Floats, off_px: Floats, noise_px: float, steepest_px: fl
     generalised least squares with errors the more alike, the nearer boundaries are. Dark or hidden LEDs move
     single boundaries: the lines through any two are weighted by how many others agree with them.
 
-    Args:
-        place: Positions of the boundaries, in spacings, float64 (n,).
-        off_px: Their offsets from an even scale, float64 (n,).
-        noise_px: Sigma of the offsets.
-        steepest_px: How far a tilt may move the boundary at place 1; others go by the square of theirs.
+    `place` (n,) are the boundaries' positions, in spacings; `off_px` (n,) their offsets from an even scale,
+    with a sigma `noise_px`. A tilt moves them by the square of their place, up to `steepest_px` at place 1.
     """
     n = len(place)
     if n < _MIN_BOUNDARIES:

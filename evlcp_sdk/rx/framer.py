@@ -153,9 +153,7 @@ class Framer(ABC):
     def discard_misses(self, *, place: Region | None = None, number: int | None = None) -> int:
         """Discard the misses counted where another link's packet was; return how many.
 
-        Args:
-            place: The packet's place; None for those of a transmitter that belongs to another link.
-            number: Its number.
+        Those at its `place`, or those of the transmitter of this `number`, which belongs to the other link.
         """
         return 0
 

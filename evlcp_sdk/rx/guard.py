@@ -41,13 +41,9 @@ _MAX_LATE_CHIPS = 1e6
 class Guard:
     """A context in which code of one algorithm runs: what it raises becomes a `PluginError` that names it.
 
-    Interrupts pass, and `ConfigError` where an algorithm may refuse its configuration. The original exception
-    is the cause. `expect` and its like check what an algorithm gave, and raise an error that shows it.
-
-    Args:
-        link: The configuration that names the algorithm.
-        role: Its role.
-        may_refuse: It is compiled here: a stream is no place to refuse a configuration.
+    Interrupts pass, and `ConfigError` where an algorithm may refuse its configuration, when it is compiled: a
+    stream is no place for that. The original exception is the cause. `expect` and its like check what an
+    algorithm gave, and raise an error that shows it.
 
     Attributes:
         checks: Whether its values are to be checked: not those of the SDK's own, which tests check.

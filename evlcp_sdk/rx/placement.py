@@ -118,21 +118,15 @@ def find_placements(
 ) -> list[Placement]:
     """Find all instances of a layout in an image, best first: a bar, and its mirror images.
 
-    Each pair of blobs of different clusters proposes a similarity, or, where the scale is known from a frame
-    before, each blob a shift; the one with most cells in their place wins, nearer cells counting more. Blobs
-    of neighbours, mirror images and strays propose in vain. Least squares over its blobs refine it; they are
-    removed, and the rest votes again.
+    Each pair of blobs of different clusters proposes a similarity, or, where the scale still holds `before`,
+    in a frame shortly before, each blob a shift; the one with most cells in their place wins, nearer cells
+    counting more. Blobs of neighbours, mirror images and strays propose in vain. Least squares over its blobs
+    refine it; they are removed, and the rest votes again.
 
     Sixteen pilots of eight values are half of all that chance can show, so that a frame decoded at a wrong
     time shows clusters, too; but not in their order. One that is in its place without having proposed it is
     there with a chance of one in K. The best instance counts if its chance is small, or if `min_share` of the
     clusters are in their place: with few clusters any order is likely. All others need a small chance.
-
-    Args:
-        presence: Of one frame.
-        layout: What to find.
-        before: In a frame shortly before, with a scale that still holds.
-        min_share: Least share of the clusters in place that counts whatever the chance.
     """
     blobs: _Blobs = _kernels.find_blobs(presence.selected, presence.grid_px)
     clusters = len(layout.centres_m)
@@ -205,13 +199,8 @@ def drop_hidden_clusters(
     """Drop the clusters whose light is not in their place: behind a cover, or out of the image.
 
     Light of neighbours that blur brings into a hidden cluster's place follows their pilots, not its own.
-
-    Args:
-        sums: Polarity sums of the pilot, int16 (chips, height, width).
-        edges: Those of the pilots, int64 (K, n).
-        every: Chips from one of them to the next.
-        presence: As from `mask_presence`.
-        placement: Of the same image.
+    `sums` are those of the pilot, int16 (chips, height, width), `edges` those of the pilots, int64 (K, n),
+    one `every` so many chips; `presence` is from `mask_presence`.
     """
     if presence.prior is None:
         return presence, placement

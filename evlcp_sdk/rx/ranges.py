@@ -110,14 +110,9 @@ class RangeCorrector:
     def step(
         self, state: RangeState, t_us: float, chip_us: float, measured: Range, line_of_sight: LineOfSight
     ) -> tuple[RangeState, Range]:
-        """Correct a frame's distance; return the new state and the distance.
+        """Correct a frame's distance by the ranging; return the new state and the distance.
 
-        Args:
-            state: What is remembered; not changed.
-            t_us: Start of the frame, us.
-            chip_us: Length of a chip, us.
-            measured: By the ranging; without a distance, or a sigma, it is returned as it is.
-            line_of_sight: Of the bar.
+        Without a distance, or a sigma, it is returned as it is. `t_us` is the start of the frame.
         """
         distance_m = measured.distance_m * line_of_sight.magnification
         sigma_m = measured.sigma_m * line_of_sight.magnification

@@ -473,12 +473,9 @@ def calibrate_llr(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:
     weights of these lie between what fits 20 000 symbols of `motion-feedback` in recordings and in the harder
     scenes of `examples/campaigns/road.toml`, and what fits a Gaussian channel; both are met within a factor
     of 2 where less than half of the frames are wrong. The nearest rival of a symbol, at its least LLR, gives
-    the probability that the symbol is right; those that are rather wrong are not given. `quality` is the
-    probability that all given ones are right, as errors come together.
-
-    Args:
-        soft: As decoded.
-        seen: Clusters that are in sight, bool (K,); the others get no symbol and LLRs of 0.
+    the probability that the symbol is right; those that are rather wrong are not given, nor are those of
+    clusters that are not `seen`, bool (K,), whose LLRs are 0. `quality` is the probability that all given
+    ones are right, as errors come together.
     """
     symbols, llr = np.empty_like(soft.symbols), np.empty_like(soft.llr)
     expected, sure = (_FRAME_WORTH, _EXPECTED_WORTH, _EXPECTED_SPREAD), (_MIN_PROBABILITY, _ERRORS_TOGETHER)

@@ -138,12 +138,10 @@ def brightness_odds(light: float) -> float:
 def pick_original(
     members: Sequence[int], odds: Mapping[tuple[int, int], float], before: Iterable[int] = ()
 ) -> int:
-    """Pick the bar itself among several images of it.
+    """Pick the bar itself among several images of it, transmitters by number.
 
-    Args:
-        members: Numbers of the transmitters.
-        odds: Log odds of the first being the bar rather than the second, for pairs of them.
-        before: Those that were bars with reflections before.
+    `odds` are log odds of the first being the bar rather than the second, for pairs of them; `before` are
+    those that were bars with reflections before.
 
     >>> pick_original([0, 1, 2], {(0, 1): -4.0, (0, 2): 1.0, (1, 2): 6.0})
     1

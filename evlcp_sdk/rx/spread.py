@@ -107,15 +107,10 @@ class Spread:
         pairs: NDArray[np.int64],
         placement: Placement,
     ) -> "Spread":
-        """Count the answers of a pilot's pixels.
+        """Count the answers of a pilot's pixels, by its polarity sums, int16 (chips, height, width).
 
-        Args:
-            sums: Polarity sums of the pilot, int16 (chips, height, width).
-            pilots: Chips of the clusters' codes, int64 (K, chips).
-            every: Chips from one edge that tells them apart to the next.
-            layout: The layout of the bar.
-            pairs: Its neighbours, int64 (n, 2).
-            placement: Where it is in the image.
+        `pilots` are the clusters' chips, int64 (K, chips), with an edge that tells them apart `every` so many
+        chips; `pairs` are neighbours, int64 (n, 2).
         """
         between = np.zeros((2, 2, 3), np.int64)
         across = np.zeros((2, 2 * _ACROSS_PX + 1), np.int64)
@@ -257,13 +252,8 @@ def _lengths_at_step(steps: int) -> Floats:
 def model_lengths(spacing_px: float, blurs_px: Floats, backgrounds: Sequence[float] | Floats) -> Floats:
     """`Spread.lengths_px` as expected for a line of clusters, all of which shine alike.
 
-    Args:
-        spacing_px: From one cluster to the next.
-        blurs_px: Added to the lens' own blur.
-        backgrounds: In the light of the middle of a cluster.
-
-    Returns:
-        float64 (blurs * backgrounds, 3).
+    For each blur, added to the lens' own, and each background, in the light of the middle of a cluster,
+    float64 (blurs * backgrounds, 3).
     """
     from evlcp_sdk.scene.optics import airy_blur, edge_profile
 

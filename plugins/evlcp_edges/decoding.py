@@ -104,10 +104,9 @@ class EdgeDecoding(Decoding):
     ) -> NDArray[np.float64]:
         """Log-likelihood of each codeword of each cluster, float64 (K, symbols).
 
-        Args:
-            seen: Histograms of each cluster's pixels by chip, float64 (K, chips, sums).
-            kinds: Kind of each chip of its codewords, int64 (K, symbols, chips).
-            counts: Histograms by kind for each cluster, or one for all, float64 (K or 1, 13, sums).
+        By histograms of each cluster's pixels by chip, `seen` (K, chips, sums), the kind of each chip of its
+        codewords, `kinds` (K, symbols, chips), and histograms by kind, for each cluster or for all, `counts`
+        (K or 1, 13, sums).
         """
         # Of each kind in each chip, by each cluster's pixels: (K, chips, kinds).
         logs = seen @ self._kind_likelihoods(counts).transpose(0, 2, 1)

@@ -30,16 +30,12 @@ def phase_only_correlation(
     """Phase-only correlation of pairs of images, float32 (height, n, width) -> (shifts, pairs, shifts).
 
     The peak of a pair is where its second image is relative to its first, and has the shape of the Dirichlet
-    kernel of the band kept. Images are small, and only few of their shifts are needed: products with matrices
-    transform them there and back in a third of the time that fast transforms of all take.
+    kernel of the band kept. Images are small, and only few of their shifts, `down` and `right`, are needed:
+    products with matrices transform them there and back in a third of the time that fast transforms of all
+    take.
 
-    Args:
-        images: The images, or the part of all of them outside of which they are dark.
-        size: Height and width of the images.
-        pairs: First and second image of each pair.
-        most: Highest harmonics kept, down and across; at most those of `full_band`.
-        down: Shifts down.
-        right: Shifts to the right.
+    `images` may be the part of all of them, of `size` (height, width), outside of which they are dark; `most`
+    are the highest harmonics kept, down and across, at most those of `full_band`.
     """
     height, n, width = images.shape
     there_down, there_across, back_down, back_across = _transforms(*size, most, down, right)

@@ -138,13 +138,9 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
     is the total of |llr| where its codeword differs from the sign of the LLR, and only grows along the path.
     Nodes whose inputs are all 0, or all but the last, or all free, are decided at once (Hashemi et al. 2016).
 
-    Args:
-        llr: LLRs of the N code bits, float32.
-        nodes: (First input, stage, kind) of each, int64 (nodes, 3).
-        size: Most paths; 1 is successive cancellation.
-        limit: A path whose metric exceeds it is dropped.
-        codewords: Takes each path's code bits, uint8 (size, N).
-        metric: Takes each path's metric, float64 (size,).
+    `nodes` are (first input, stage, kind) of each, int64 (nodes, 3), of a code of float32 LLRs (N,). A path
+    whose metric exceeds `limit` is dropped, and `size` at most are kept, 1 for successive cancellation.
+    `codewords`, uint8 (size, N), and `metric`, float64 (size,), take code bits and metric of each path.
     """
     n, stages = len(llr), 0
     while 1 << stages < n:

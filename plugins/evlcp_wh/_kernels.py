@@ -240,20 +240,15 @@ def learn_pair_llr(
 ) -> None:
     """Learn the log ratio of how often each pair of sums comes with values of +1 and -1, `out` (pairs,).
 
-    A pixel that more likely shows one cluster than any other, or none, counts for it by its probability. To
-    each pair `prior` is added, on average of the two values, in proportion to their counts, so that a pair
-    that comes with both alike has a ratio of 0. A pilot of one value throughout, as that of a lone cluster,
-    does not show the other: that is taken to be the same with all signs changed.
+    A pixel that more likely shows one cluster than any other, or none, counts for it by its `probability` (K,
+    rows, columns), in cells of side `grid`. To each pair `prior` is added, on average of the two values, in
+    proportion to their counts, so that a pair that comes with both alike has a ratio of 0. A pilot of one
+    value throughout, as that of a lone cluster, does not show the other: that is taken to be the same with
+    all signs changed.
 
-    Args:
-        sums: Polarity sums, int16 (chips, height, width).
-        most: They are clipped to -most to most; 7 at most.
-        signs: Whether the pilots' values are +1, uint64 (K, values).
-        probability: Of each cluster in each cell, (K, rows, columns).
-        grid: Side of a cell.
-        prior: Observations added.
-        pairs: Takes the pair of each value in each pixel, uint8 (values, pixels).
-        out: Takes the log ratios.
+    Sums, int16 (chips, height, width), are clipped to -most to most, 7 at most. `signs` are whether the
+    pilots' values are +1, uint64 (K, values); `pairs` takes the pair of each value in each pixel, uint8
+    (values, pixels).
     """
     clusters, known = signs.shape
     _, rows, columns = probability.shape

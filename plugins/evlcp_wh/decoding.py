@@ -29,17 +29,12 @@ _PIXEL_SHARE = 0.05
 def match_words(
     values: NDArray[np.float64], by_value: NDArray[np.float64], bits: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], float, float]:
-    """Nearest words of each cluster's values, float64 (K, n).
-
-    Args:
-        values: Of each cluster.
-        by_value: The words, float64 (n, 2**bits or more); those beyond 2**bits carry no bits.
-        bits: Of a symbol.
+    """Match clusters' values, float64 (K, n), with the nearest of the words, float64 (n, 2**bits or more).
 
     Returns:
         Their numbers, int64 (K,), and their correlations, float64 (K,); by how much words with a bit 0
-        correlate better than those with 1, max-log, float64 (K, bits); the share of the values' sizes that
-        agrees with the words; and the least size of a margin.
+        correlate better than those with 1, max-log, of the 2**bits first, float64 (K, bits); the share of the
+        values' sizes that agrees with the words; and the least size of a margin.
     """
     symbols, best = np.empty(len(values), np.int64), np.empty(len(values))
     margins = np.empty((len(values), bits))
@@ -116,11 +111,7 @@ class MlDecoder:
     def decode(
         self, presence: PresenceMap, sums: NDArray[np.int16]
     ) -> tuple[SoftSymbols, float, NDArray[np.uint8], NDArray[np.float64]]:
-        """Decode the likeliest codewords by all pixels that show a cluster.
-
-        Args:
-            presence: Of the frame.
-            sums: The frame's polarity sums, pilot first, int16 (chips, height, width).
+        """Decode the likeliest codewords by all pixels that show a cluster; sums begin with the pilot.
 
         Returns:
             The symbols; the least size of an LLR; the pair of its chips' polarity sums of -n to n events that
