@@ -161,7 +161,7 @@ def describe_signature(message: Message, now_s: float | None) -> tuple[str, floa
     """When a verified beacon was signed, in words, and how long before it was received, s; None if unknown.
 
     >>> from evlcp_sdk.air.blocks import Kind
-    >>> signed_text(Message(Kind.BEACON, 7, 1_800_000_000, b"1"), 1_800_007_200.0)
+    >>> describe_signature(Message(Kind.BEACON, 7, 1_800_000_000, b"1"), 1_800_007_200.0)
     ('signed 2027-01-15 08:00:00 UTC, 2 hours before it was received', 7200.0)
     """
     signed = f"signed {_format_utc(message.sequence)}"
