@@ -96,40 +96,37 @@ def judge_events(
     Returns:
         (events judged, whether those held from earlier calls have become doubtful).
     """
-    leap, held_leap, setback, enough, span, most, far = limits
+    pause_us, held_pause_us, setback_us, agree_events, agree_us, most_held, farthest_us = limits
     last, first_held, last_held, held = state[0], state[1], state[2], state[3]
-    since = 0
-    lost = False
-    done = t_us.size
+    since, lost, done = 0, False, t_us.size
     for i in range(t_us.size):
         t = t_us[i]
+        is_next = last <= t <= last + pause_us
         if x[i] >= width or y[i] >= height:
             verdicts[i] = 1
-        elif t > far or t < -far:
+        elif t > farthest_us or t < -farthest_us:
             verdicts[i] = 2
-        elif last <= t <= last + leap:
-            if held:
-                lost = lost or since == 0
-                for k in range(since, i):
-                    verdicts[k] = 2 if verdicts[k] == 4 else verdicts[k]
-                held = 0
-            verdicts[i] = 3
-            last = t
-        elif last - setback <= t < last or (held and last_held - setback <= t < last_held):
+        elif not is_next and (
+            last - setback_us <= t < last or (held and last_held - setback_us <= t < last_held)
+        ):
             verdicts[i] = 0
         else:
-            if held and not last_held <= t <= last_held + held_leap:
+            if held and (is_next or not last_held <= t <= last_held + held_pause_us):
                 lost = lost or since == 0
                 for k in range(since, i):
                     verdicts[k] = 2 if verdicts[k] == 4 else verdicts[k]
                 held = 0
+            if is_next:
+                verdicts[i] = 3
+                last = t
+                continue
             if not held:
                 first_held = t
                 since = i
             verdicts[i] = 4
             last_held = t
             held += 1
-            if (held >= enough and t - first_held >= span) or held >= most:
+            if (held >= agree_events and t - first_held >= agree_us) or held >= most_held:
                 held = -1
                 done = i + 1
                 break

@@ -154,7 +154,7 @@ class CameraClock:
             number, are_lost = _kernels.judge_events(
                 events.t_us, events.x, events.y, *self._size, limits, self._state, verdicts
             )
-            judged, verdicts = events[:number], verdicts[:number]
+            processed, verdicts = events[:number], verdicts[:number]
             events = events[number:]
             if are_lost:
                 self._drop_held()
@@ -162,11 +162,11 @@ class CameraClock:
             for verdict, name in enumerate(_DROPPED):
                 self._count_dropped_where(name, verdicts == verdict, first)
             if (kept := verdicts == _KEPT).any():
-                pieces.append(self._to_stream_time(judged[kept]))
+                pieces.append(self._to_stream_time(processed[kept]))
             if (held := verdicts == _HELD).any():
                 if not self._held:
                     self._first_held = first + int(held.argmax())
-                self._held.append(judged[held])
+                self._held.append(processed[held])
             if self._state[3] < 0:
                 # The last one has confirmed those that are held.
                 pieces.append(self._confirm_held())

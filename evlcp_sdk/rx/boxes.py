@@ -44,14 +44,14 @@ def cut_neighbours(box: Box, bar: Box, others: list[Box]) -> Box:
     for other in others:
         if other == bar or not boxes_overlap(box, other):
             continue
-        beside = max(other[0] - bar[2], bar[0] - other[2]), (bar[2] - bar[0]) / 2
-        below = max(other[1] - bar[3], bar[1] - other[3]), (bar[3] - bar[1]) / 2
-        if below[0] >= beside[0] and -below[0] < below[1]:
+        gap_x, half_x = max(other[0] - bar[2], bar[0] - other[2]), (bar[2] - bar[0]) / 2
+        gap_y, half_y = max(other[1] - bar[3], bar[1] - other[3]), (bar[3] - bar[1]) / 2
+        if gap_y >= gap_x and -gap_y < half_y:
             if other[1] > bar[1]:
                 bottom = min(bottom, other[1])
             else:
                 top = max(top, other[3])
-        elif beside[0] > below[0] and -beside[0] < beside[1]:
+        elif gap_x > gap_y and -gap_x < half_x:
             if other[0] > bar[0]:
                 right = min(right, other[0])
             else:

@@ -544,7 +544,8 @@ class PacketFramer(Framer):
         for centre_px, size_px in shown.others:
             known = any(one.covers_point(shown.t_us, centre_px) for one in self._regions.alive)
             if not known and self._follower.has_room():
-                self._due.append(self._follower.open_duplicate(region, shown.t_us, centre_px, size_px))
+                image = BarPlace(shown.t_us, centre_px, size_px)
+                self._due.append(self._follower.open_duplicate(region, image))
 
     def _retime_frame(self, transmitter: Transmitter, due: DueFrame) -> DueFrame:
         """Time a frame that is due anew where the light has changed since the preamble."""

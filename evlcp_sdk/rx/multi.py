@@ -94,7 +94,7 @@ class LinkArbiter:
         """Whether any packet waits."""
         return bool(self._waiting)
 
-    def owned_places(self, link: int) -> list[Region]:
+    def find_owned_places(self, link: int) -> list[Region]:
         """Places that transmitters of other links own, extended as by `extend_place`."""
         return [
             self.extend_place(place)

@@ -12,7 +12,7 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import name_links
 from evlcp_sdk.plugin.roles import STEPS
-from evlcp_sdk.rx.detected import DetectorTracker
+from evlcp_sdk.rx.detector import DetectorTracker
 from evlcp_sdk.rx.framer import SILENT, Announcer, Framer, StreamContext, to_camera_time
 from evlcp_sdk.rx.framing import PacketFramer
 from evlcp_sdk.rx.guard import compile_tracker
@@ -147,9 +147,9 @@ class Receiver:
         total: Counter[str] = Counter()
         for one in self._receivers:
             total.update(one.counts)
-        crowded = {"dropped_crowded": self._timeline.dropped}
+        dropped = {"dropped_crowded": self._timeline.dropped}
         withdrawn = {} if self._arbiter is None else {"frames_withdrawn": self._reporter.withdrawn}
-        return self._clock.counts | crowded | dict(total) | withdrawn
+        return self._clock.counts | dropped | dict(total) | withdrawn
 
     @property
     def link_counts(self) -> dict[str, dict[str, int]]:
@@ -183,7 +183,7 @@ class Receiver:
             return []
         self._closed = True
         for one in self._receivers:
-            one.end_at(self._clock.last_us)
+            one.set_stream_end(self._clock.last_us)
         packets = [packet for step in self._timeline.close() for packet in self._process_step(step)]
         last = [one.finish() for one in self._receivers]
         if self._arbiter is None:
@@ -217,7 +217,7 @@ class Receiver:
             (one,) = self._receivers
             return one.read_messages(one.step(step))
         for number, one in enumerate(self._receivers):
-            packets = one.step(step, arbiter.owned_places(number), arbiter.owners)
+            packets = one.step(step, arbiter.find_owned_places(number), arbiter.owners)
             arbiter.add(number, one.places, packets, step.end_us)
         return self._arbitrate(arbiter, step.end_us)
 
@@ -345,7 +345,7 @@ class LinkReceiver:
                 self._tracker.drop(region)
                 self.framing.forget_region(region)
 
-    def end_at(self, end_us: float) -> None:
+    def set_stream_end(self, end_us: float) -> None:
         """Set when the stream ends, us: frames that this cuts are dropped."""
         if self.framing.drops_cut_frames:
             self._queue.stream_end_us = end_us

@@ -446,7 +446,7 @@ _CENTRE_SIGMA_PX = 0.25
 
 _COUNTS = ("steps_forgotten", "dropped_no_room", "regions_left_out", "regions_gave_way", "areas_left_out")
 
-_CORRECTED_PX = 1.0
+_CORRECTION_PX = 1.0
 """Deviation from its bar, in place or size, from which on a region is corrected: a fifth of its seam."""
 
 _REMNANT_STEPS = 6
@@ -495,7 +495,7 @@ class RhythmTracker(RegionTracker):
         )
         # Emptied once a step: two bytes each.
         self._hits = np.zeros([(n - 1 >> CELL_SHIFT) + 1 for n in (camera.height, camera.width)], np.int16)
-        self._fresh: list[Box] = []
+        self._new_boxes: list[Box] = []
         self._sweeps: list[Sweep] = []
         self._recent: deque[Piece] = deque()
         self._most_recent = max(math.ceil(min(keep_us, _MOST_RECENT_US) / spec.step_us), BACKFILL_STEPS)
@@ -592,7 +592,7 @@ class RhythmTracker(RegionTracker):
 
     def skip_gap(self) -> None:
         """See `RegionTracker`."""
-        self._fresh = []
+        self._new_boxes = []
         self._recent.clear()
         self._recent_bytes = 0
 
@@ -646,7 +646,7 @@ class RhythmTracker(RegionTracker):
             last = region.latest
             until_us = last.t_us + _REMNANT_STEPS * self._spec.step_us
             region.initial_extent = -off[0], -off[1], last.width_px, last.height_px, until_us
-        elif off_px < _CORRECTED_PX:
+        elif off_px < _CORRECTION_PX:
             return 0.0
         region.size_px = size_px
         # Where less of the bar was seen, or more than it, its place is not that of what was seen.
@@ -681,21 +681,14 @@ class RhythmTracker(RegionTracker):
         )
         self.drop(other)
 
-    def open_duplicate(
-        self, like: TrackedRegion, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
-    ) -> TrackedRegion:
+    def open_duplicate(self, original: TrackedRegion, bar: BarPlace) -> TrackedRegion:
         """Open a region for another image of a bar, which moves as the region that showed it does."""
         id, self._next_id = self._next_id, self._next_id + 1
-        region = TrackedRegion(
-            id,
-            like.track.copy_shifted(id, 0.0, 0.0),
-            like.first_us,
-            deque(like.pieces),
-            filter=like.filter,
-            opened_us=like.opened_us,
-        )
+        track, pieces = original.track.copy_shifted(id, 0.0, 0.0), deque(original.pieces)
+        region = TrackedRegion(id, track, original.first_us, pieces, filter=original.filter)
+        region.opened_us = original.opened_us
         self.alive.append(region)
-        self.correct_region(region, BarPlace(t_us, centre_px, size_px))
+        self.correct_region(region, bar)
         self.gather_events(region)
         return region
 
@@ -785,7 +778,7 @@ class RhythmTracker(RegionTracker):
         if known is None or -STRAY_PX <= seen_px - whole_px <= 2 * _BLUR_PX:
             heights.append(seen_px)
         # Once a bar's height is known, a part of it tells nothing of that.
-        height_px = median(heights) if heights else whole_px
+        height_px = _median(heights) if heights else whole_px
         excess_px = seen_px - height_px
         if excess_px > STRAY_PX:
             # A bar of unknown size may grow to either side.
@@ -808,9 +801,9 @@ class RhythmTracker(RegionTracker):
     ) -> tuple[Any, Region, tuple[float, float]] | None:
         """Measure a region in a box: its filter's new state, place and velocity; None if it is not seen."""
         last, before = region.latest, region.track.previous
-        right, down, apart_us = last.x_px - before.x_px, last.y_px - before.y_px, last.t_us - before.t_us
+        right, down, gap_us = last.x_px - before.x_px, last.y_px - before.y_px, last.t_us - before.t_us
         sweep = None
-        if region.velocity_px_us != STILL or max(abs(right), abs(down)) > FAST_PX_US * apart_us:
+        if region.velocity_px_us != STILL or max(abs(right), abs(down)) > FAST_PX_US * gap_us:
             sweep = self._fit_sweep(region, box, middle_us)
         if sweep is not None:
             t_us, rows, velocity_px_us = middle_us - self._chip_us, sweep.rows, sweep.velocity_px_us
@@ -832,10 +825,10 @@ class RhythmTracker(RegionTracker):
     def _fit_sweep(self, region: TrackedRegion, box: Box, middle_us: float) -> Sweep | None:
         """Fit a sweep to a region's newest events; None where it is slow enough for its pixels to blink."""
         last, before = region.latest, region.track.previous
-        upright, apart_us = last.height_px > last.width_px, last.t_us - before.t_us
+        upright, gap_us = last.height_px > last.width_px, last.t_us - before.t_us
         along_px_us = region.velocity_px_us[1 if upright else 0]
-        if apart_us > 0:
-            along_px_us = (last.y_px - before.y_px if upright else last.x_px - before.x_px) / apart_us
+        if gap_us > 0:
+            along_px_us = (last.y_px - before.y_px if upright else last.x_px - before.x_px) / gap_us
         sweep = fit_sweep(region.pieces[-1][1], middle_us, box, along_px_us, FAST_PX_US)
         return sweep if sweep is not None and sweep.is_fast else None
 
@@ -896,7 +889,7 @@ class RhythmTracker(RegionTracker):
                 if region.initial_extent is not None and end_us > region.initial_extent[4]:
                     known.append(self._search_box(*_initial_place(region)))
             rises -= _kernels.clear_cells(hits, np.array(known, np.int64), CELL_SHIFT)
-        before, self._fresh, boxes = self._fresh, [], []
+        before, self._new_boxes, boxes = self._new_boxes, [], []
         if rises >= _LEAST_RISES:
             areas, left_out = find_areas(hits, self._limits.areas, self._sensor_px)
             self.counts["areas_left_out"] += left_out
@@ -909,7 +902,7 @@ class RhythmTracker(RegionTracker):
             if any(boxes_overlap(grow_box(box, merge_px), other) for other in before):
                 self._open_region(box, end_us)
             else:
-                self._fresh.append(box)
+                self._new_boxes.append(box)
 
     def _open_region(self, box: Box, end_us: int) -> None:
         place = self._measure_place(None, box, end_us)
@@ -918,22 +911,22 @@ class RhythmTracker(RegionTracker):
         reach = self._search_box(*place)
         # Lamps whose pixels were not known as such in the step before are now.
         (newest,) = self._detector.select(self._recent[-1][1], [reach], [True], OPENING_REPEATS)
-        if not len(newest) or not self._find_room(end_us):
+        if not len(newest) or not self._make_room(end_us):
             return
         id, self._next_id = self._next_id, self._next_id + 1
         found = make_region(id, end_us - self._latency_us, *place)
-        wholes = [
+        parents = [
             one
             for one in self.alive
             if one.initial_extent
             and found.t_us <= one.initial_extent[4]
             and _is_in_initial_extent(found, one)
         ]
-        if wholes:
+        if parents:
             # It was seen as long as the one that it was taken to be a part of.
-            whole = wholes[0].latest
-            size_px, right, down = place[2:], found.x_px - whole.x_px, found.y_px - whole.y_px
-            track = wholes[0].track.copy_shifted(id, right, down, size_px)
+            parent = parents[0].latest
+            size_px, right, down = place[2:], found.x_px - parent.x_px, found.y_px - parent.y_px
+            track = parents[0].track.copy_shifted(id, right, down, size_px)
             pieces = deque((start, Events.empty()) for start, _ in self._recent)
         else:
             track, recent = RegionTrack([found]), list(self._recent)[-BACKFILL_STEPS:]
@@ -942,7 +935,7 @@ class RhythmTracker(RegionTracker):
             )
         filter = self._init_filter()
         region = TrackedRegion(id, track, pieces[0][0], pieces, filter=filter, opened_us=end_us)
-        if wholes:
+        if parents:
             self.gather_events(region)
         self.alive.append(region)
 
@@ -965,7 +958,7 @@ class RhythmTracker(RegionTracker):
             if same is not None:
                 same.velocity_px_us = velocity_px_us
                 continue
-            if not self._find_room(start_us + step_us):
+            if not self._make_room(start_us + step_us):
                 continue
             t_us, id = start_us + step_us / 2 - self._chip_us, self._next_id
             track = RegionTrack(
@@ -981,7 +974,7 @@ class RhythmTracker(RegionTracker):
                 other.released |= other.velocity_px_us == STILL and boxes_overlap(swept, box_of(other.latest))
             self.alive.append(region)
 
-    def _find_room(self, now_us: int) -> bool:
+    def _make_room(self, now_us: int) -> bool:
         """Whether a new region may be tracked; the oldest one that never showed a bar may give way to it."""
         tracked = [one for one in self.alive if not one.released]
         if len(tracked) < self._limits.regions:
@@ -1006,8 +999,8 @@ class RhythmTracker(RegionTracker):
                 continue
             one, other = older.latest, younger.latest
             sized = (older.size_px is not None) + (younger.size_px is not None)
-            apart_px = max(abs(one.x_px - other.x_px), abs(one.y_px - other.y_px))
-            if sized == 0 or apart_px <= SAME_PX or (sized == 1 and is_same_place(one, other)):
+            distance_px = max(abs(one.x_px - other.x_px), abs(one.y_px - other.y_px))
+            if sized == 0 or distance_px <= SAME_PX or (sized == 1 and is_same_place(one, other)):
                 younger.released = True
 
 
@@ -1041,7 +1034,7 @@ def _is_in_initial_extent(place: Region, region: TrackedRegion) -> bool:
     return abs(place.x_px - x_px) <= width_px / 2 and abs(place.y_px - y_px) <= height_px / 2
 
 
-def median(values: Collection[float]) -> float:
+def _median(values: Collection[float]) -> float:
     """The same as `statistics.median`, in a third of the time."""
     ordered = sorted(values)
     return (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2

@@ -34,10 +34,10 @@ _WIDEST_PX = 5.0
 _LEAST_SHARE = 0.6
 """Share of the events that lie on the line."""
 
-_EDGE = 0.25
+_LIT_SHARE = 0.25
 """Share of the median of rows (of a lying bar: columns) from which on one belongs to the bar."""
 
-_CHANCE = 4.0
+_LEAST_PHASE_SUM = 4.0
 """Length of the sum of the phases of rises in a chip, in roots of their number, from which on they come with
 the chips: random ones reach it once in 10 million cases."""
 
@@ -126,7 +126,7 @@ def _find_ends(places: NDArray[np.float64]) -> tuple[float, float]:
     """First and last px of a line that hold what most of its px hold."""
     first = math.floor(float(places.min()))
     counts = np.bincount((np.rint(places) - first).astype(np.int64))
-    lit = np.flatnonzero(counts >= _EDGE * float(np.median(counts[counts > 0])))
+    lit = np.flatnonzero(counts >= _LIT_SHARE * float(np.median(counts[counts > 0])))
     return float(first + lit[0]), float(first + lit[-1])
 
 
@@ -137,7 +137,7 @@ def has_chip_rhythm(events: Events, box: Box, chip_us: float) -> bool:
     if not t_us.size:
         return False
     phases = np.exp(2j * math.pi / chip_us * (t_us - t_us[0])).sum()
-    return bool(abs(phases) > _CHANCE * math.sqrt(t_us.size))
+    return bool(abs(phases) > _LEAST_PHASE_SUM * math.sqrt(t_us.size))
 
 
 def find_sweeps(

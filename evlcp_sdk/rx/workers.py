@@ -75,10 +75,10 @@ class Workers:
             WorkerError: One does not start.
         """
         if processes < 1 or (processes > 1 and has_announcer):
-            why = (
+            reason = (
                 ", as a sink or plugin follows the stages" if has_announcer and processes > 0 else " or more"
             )
-            raise ConfigError(f"workers: {processes}, expected 1{why}")
+            raise ConfigError(f"workers: {processes}, expected 1{reason}")
         # Links whose bars have frames that can be decoded by themselves.
         shared = {
             name: link
@@ -180,7 +180,7 @@ class _Worker:
             begin += size
         return places, memory
 
-    def receive(self, within_s: float) -> Any:
+    def receive(self, timeout_s: float) -> Any:
         """Receive the next answer.
 
         Raises:
@@ -188,8 +188,8 @@ class _Worker:
             Exception: What failed there.
         """
         try:
-            if not _wait_readable(self._poller, within_s):
-                raise self._stall_error(within_s)
+            if not _wait_readable(self._poller, timeout_s):
+                raise self._stall_error(timeout_s)
             answer = self._pipe.recv()
         except (OSError, EOFError) as fault:
             raise self._exit_error() from fault
@@ -264,7 +264,7 @@ def _make_poller(pipe: Connection) -> select.poll:
     return poller
 
 
-def _wait_readable(poller: select.poll, within_s: float | None) -> bool:
+def _wait_readable(poller: select.poll, timeout_s: float | None) -> bool:
     """Wait until there is something to receive; False if there is not in time.
 
     At first without sleep: who sleeps is woken on the core of the one that wakes it, which then waits.
@@ -274,7 +274,7 @@ def _wait_readable(poller: select.poll, within_s: float | None) -> bool:
         os.sched_yield()
         if poller.poll(0):
             return True
-    return bool(poller.poll(None if within_s is None else within_s * 1000))
+    return bool(poller.poll(None if timeout_s is None else timeout_s * 1000))
 
 
 def _columns_at(memory: NDArray[np.uint8], begin: int, number: int) -> _kernels.Columns:

@@ -203,7 +203,7 @@ def test_a_region_does_not_go_on_to_the_bar_below():
             (own,) = found
             t_us = own.latest.t_us
             regions.correct_region(own, BarPlace(t_us, CENTRE, SIZE))
-            other = regions.open_duplicate(own, t_us, below, SIZE)
+            other = regions.open_duplicate(own, BarPlace(t_us, below, SIZE))
             before = own.track.previous
             own.track = RegionTrack([replace(before, y_px=before.y_px - 7), own.latest])
         elif start > 10_000:
@@ -252,7 +252,7 @@ def test_of_two_regions_that_follow_the_same_the_older_stays():
         if start == 10_000:
             (first,) = found
             regions.correct_region(first, BarPlace(first.latest.t_us, CENTRE, SIZE))
-            regions.open_duplicate(first, first.latest.t_us, (CENTRE[0], CENTRE[1] + 3), SIZE)
+            regions.open_duplicate(first, BarPlace(first.latest.t_us, (CENTRE[0], CENTRE[1] + 3), SIZE))
     assert regions.alive == [first]
 
 
