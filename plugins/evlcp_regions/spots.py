@@ -91,8 +91,7 @@ _BLUR_PX = 4.0
 class Spots(Detection):
     """Small lights that go on and off, each followed by its bursts, and by its motion while it is on.
 
-    For single LEDs at a hundred to tens of thousands of bits a second, which may be dark or lit for many
-    bits.
+    For single LEDs at a hundred to tens of thousands of bits a second, dark and lit for many bits.
     """
 
     reach_px: Annotated[float, Field(gt=2, le=64, description="How far from its centre a light is seen.")] = (
@@ -126,8 +125,7 @@ class _Spot:
         right_px_us: Its velocity in columns.
         down_px_us: Its velocity in rows.
         size_px: Root mean square of the distances of events from its centre.
-        burst: Usual events of a burst in which the light turns; not of the trail, while bright pixels
-            go on.
+        burst: Usual events of a burst in which the light turns; not of the trail, while bright pixels go on.
         lit: The last burst was ON.
         turned_us: When the polarity of its bursts changed last, us.
         found_us: When it was found, us.
@@ -303,8 +301,8 @@ class _SpotDetector:
         """Follow lights through a step, the brightest first; return them with their places in it."""
         followed: dict[int, tuple[_Spot, float, float]] = {}
         x, y = events.x.astype(np.float64), events.y.astype(np.float64)
-        for spot in sorted(spots, key=lambda one: -one.burst):
-            brighter = [(x, y) for one, x, y in followed.values() if one.burst > _VEIL_RATIO * spot.burst]
+        for spot in sorted(spots, key=lambda spot: -spot.burst):
+            brighter = [(u, v) for other, u, v in followed.values() if other.burst > _VEIL_RATIO * spot.burst]
             followed[spot.id] = self._follow_spot(spot, start_us, now_us, events, (x, y), brighter)
         return [followed[spot.id] for spot in spots]
 
@@ -334,10 +332,9 @@ class _SpotDetector:
         if len(near) < _LEAST_EVENTS:
             return spot, x_px, y_px
         x, y, t, on = x[near], y[near], events.t_us[near], events.p[near] > 0
+        least = max(_LEAST_EVENTS, _BURST_SHARE * spot.burst)
         slot = self._slot_numbers(t, start_us)
-        burst = self._find_burst(
-            x, y, slot, on, max(_LEAST_EVENTS, _BURST_SHARE * spot.burst), (x_px, y_px, gate_px)
-        )
+        burst = self._find_burst(x, y, slot, on, least, (x_px, y_px, gate_px))
         if burst is not None:
             u_px, v_px, number, lit = burst
             if lit != spot.lit:
@@ -347,29 +344,22 @@ class _SpotDetector:
             u_px, v_px = x_px, y_px
         else:
             return spot, x_px, y_px
-        reach_px = self.spec.reach_px
         for _ in range(2):
-            inside = (np.abs(x - u_px) <= reach_px) & (np.abs(y - v_px) <= reach_px)
+            inside = (np.abs(x - u_px) <= self.spec.reach_px) & (np.abs(y - v_px) <= self.spec.reach_px)
             if inside.sum() < _LEAST_EVENTS:
                 return spot, x_px, y_px
             u_px, v_px = float(x[inside].mean()), float(y[inside].mean())
         t_us = float(t[inside].mean())
         size_px = float(np.sqrt(((x[inside] - u_px) ** 2 + (y[inside] - v_px) ** 2).mean() / 2))
+        size_px = spot.size_px + _SIZE_GAIN * (size_px - spot.size_px)
         since_us = max(t_us - spot.t_us, 1.0)
         share = since_us / (since_us + _AGILITY_US)
         most_px_us = self.spec.speed_px_ms * 1e-3
         right_px_us = spot.right_px_us + share * ((u_px - spot.x_px) / since_us - spot.right_px_us)
         down_px_us = spot.down_px_us + share * ((v_px - spot.y_px) / since_us - spot.down_px_us)
-        spot = replace(
-            spot,
-            t_us=t_us,
-            x_px=u_px,
-            y_px=v_px,
-            right_px_us=min(max(right_px_us, -most_px_us), most_px_us),
-            down_px_us=min(max(down_px_us, -most_px_us), most_px_us),
-            size_px=spot.size_px + _SIZE_GAIN * (size_px - spot.size_px),
-        )
-        return spot, u_px, v_px
+        right_px_us, down_px_us = (min(max(v, -most_px_us), most_px_us) for v in (right_px_us, down_px_us))
+        spot = replace(spot, t_us=t_us, x_px=u_px, y_px=v_px, size_px=size_px)
+        return replace(spot, right_px_us=right_px_us, down_px_us=down_px_us), u_px, v_px
 
     def _find_burst(
         self,
@@ -387,8 +377,9 @@ class _SpotDetector:
         row = ((y - y_px + gate_px) / _FINE_PX).astype(np.int64)
         slots = int(slot.max()) + 1
         index = (slot * cells + row) * cells + column
-        every = np.bincount(index, minlength=slots * cells * cells).reshape(slots, cells, cells)
-        ones = np.bincount(index[on], minlength=slots * cells * cells).reshape(slots, cells, cells)
+        # Events and ON events by blocks of 2 x 2 cells.
+        every, ones = (np.bincount(some, minlength=slots * cells * cells) for some in (index, index[on]))
+        every, ones = (counts.reshape(slots, cells, cells) for counts in (every, ones))
         every, ones = (counts[:, :-1] + counts[:, 1:] for counts in (every, ones))
         every, ones = (counts[..., :-1] + counts[..., 1:] for counts in (every, ones))
         excess = np.abs(2 * ones - every)

@@ -16,7 +16,7 @@ ROWS = {
         *("results", "report", "study live", "run simulated warming", "testing", "cli"),
     ),
     "evlcp_sdk/rx": (
-        *("_kernels", "boxes distortion limits", "rhythm sweeps", "guard regions trust", "detected framer"),
+        *("_kernels", "boxes distortion limits", "rhythm sweeps", "guard regions trust", "detector framer"),
         *("inbox placement ranges", "points spread", "alignment", "reflections reading"),
         *("plugin_framing transmitters workers", "framing multi", "receiver"),
     ),
