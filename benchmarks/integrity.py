@@ -410,7 +410,7 @@ def drive(world: World, rng: np.random.Generator, spec: ErrorModel) -> tuple[lis
                     noise_m2=found.noise,
                     slow_m2=found.slow,
                     standing=found.standing,
-                    weakest_axis=found.along,
+                    weakest_axis=found.weakest_axis,
                     standing_slope=found.standing_slope,
                     heading_deg=Attitude.of_rotation(found.rotation).heading_deg or 0.0,
                 )

@@ -419,9 +419,7 @@ class _ViewModel:
 def solve_views(
     views: Sequence[WhitenedView], camera: CameraModel, root: Floats, common: tuple[float, float] = (0.0, 0.0)
 ) -> ViewSolution:
-    """Solve the least squares of all views; the fit starts at `camera`, other arguments are as of
-    `_ViewModel`.
-    """
+    """Solve the least squares of all views, from `camera` on; other arguments are as of `_ViewModel`."""
     surveys: dict[int, tuple[float, float, float]] = {}
     for view in views:
         surveys |= {n: sigma for n, sigma in view.survey.items() if any(sigma) or view.curvature_px.any()}
@@ -434,17 +432,15 @@ def solve_views(
         return model.linearize(x)[1]
 
     start = np.zeros(_CAMERA_SIZE + 6 * len(views) + _BAR_SIZE * len(surveys) + 6)
-    fit = least_squares(residuals_of, start, slopes_of, x_scale="jac", max_nfev=_STEPS)
-    residuals, rows = model.linearize(fit.x)
+    x = least_squares(residuals_of, start, slopes_of, x_scale="jac", max_nfev=_STEPS).x
+    residuals, rows = model.linearize(x)
     scale = 1 / np.sqrt((rows**2).sum(0))
-    root = np.linalg.inv(np.linalg.qr(rows * scale, mode="r"))
-    covariance = (root @ root.T) * scale * scale[:, None]
+    factor = np.linalg.inv(np.linalg.qr(rows * scale, mode="r"))
+    covariance = (factor @ factor.T) * scale * scale[:, None]
     points = 2 * sum(len(v.points_px) for v in views)
-    freedom = max(points - _CAMERA_SIZE - 3 * len(views), 1)
+    misfit = float(residuals @ residuals) / max(points - _CAMERA_SIZE - 3 * len(views), 1)
     slices = {number: slice(column, column + _BAR_SIZE) for number, column in model.bars.items()}
-    return ViewSolution(
-        model.camera_of(fit.x), fit.x, covariance, slices, float(residuals @ residuals) / freedom
-    )
+    return ViewSolution(model.camera_of(x), x, covariance, slices, misfit)
 
 
 def _site_slope(arm_m: Floats, survey: tuple[float, float, float]) -> Floats:

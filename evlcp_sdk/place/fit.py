@@ -365,14 +365,12 @@ def invert_definite(matrix: Floats) -> Floats | None:
             return None
     except np.linalg.LinAlgError:
         return None
-    inverse: Floats = np.linalg.inv(scaled) * scale * scale[:, None]
-    return inverse
+    return np.asarray(np.linalg.inv(scaled) * scale * scale[:, None])
 
 
 def _multiply_each(vectors: Floats, matrices: Floats) -> Floats:
     """Products of vectors (n, k) and matrices (n, k, m), from the left."""
-    product: Floats = (vectors[:, None, :] @ matrices)[:, 0]
-    return product
+    return np.asarray((vectors[:, None, :] @ matrices)[:, 0])
 
 
 def _linearize_attitude(problem: Problem, rotation: Floats) -> tuple[Floats, Floats]:

@@ -91,9 +91,9 @@ class Pose:
     hpl_m: float
     vpl_m: float
     excluded: tuple[str, ...] = ()
-    along: Floats = field(default_factory=lambda: np.zeros(3))
+    weakest_axis: Floats = field(default_factory=lambda: np.zeros(3))
     standing_slope: Mapping[str, Floats] = field(default_factory=dict)
-    hidden_m: Floats = field(default_factory=lambda: np.full(3, math.inf))
+    undetected_m: Floats = field(default_factory=lambda: np.full(3, math.inf))
     failed: FailedBar | None = None
     warning: str = ""
     tests: Mapping[str, float] = field(default_factory=dict)
@@ -141,9 +141,9 @@ def assess_fit(fit: Equations) -> Pose | Rejection:
         problem.transmitters,
         _limit_level(horizontal_m, spec),
         _limit_level(vertical_m, spec),
-        along=axes[:, -1],
+        weakest_axis=axes[:, -1],
         standing_slope=_name_moves(problem, *slopes),
-        hidden_m=hidden_m,
+        undetected_m=hidden_m,
         warning=worst or (warning if has_misfit else ""),
         tests=tests,
     )

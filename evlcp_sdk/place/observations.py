@@ -264,7 +264,7 @@ class Problem:
             if count >= spec.min_points:
                 pixel_px = spec.pixel_sigma_px if view.pixel_px is None else view.pixel_px
                 sigma_px = view.sigma_px[usable, None]
-                # From the whole bar's centre: errors of its attitude turn it about that, whatever is seen.
+                # From the whole bar's centre, about which errors of its attitude rotate it.
                 arm = (view.enu_m - view.enu_m.mean(0))[usable]
                 share = np.minimum((pixel_px / sigma_px) ** 2, 1.0)
                 transmitters.append(view.transmitter)
@@ -355,8 +355,7 @@ def find_whole_clusters(points_px: Floats, sigma_px: Floats, width: int, height:
         first, last = seen[0], seen[-1]
         edge += 0.75 * math.dist(points_px[first], points_px[last]) / (last - first)
     is_inside = (points_px >= edge) & (points_px <= np.array([width, height]) - 1 - edge)
-    usable: NDArray[np.bool_] = is_inside.all(1) & (sigma_px > 0) & (sigma_px < math.inf)
-    return usable
+    return np.asarray(is_inside.all(1) & (sigma_px > 0) & (sigma_px < math.inf))
 
 
 def compute_shared_errors(

@@ -196,7 +196,7 @@ class Positioner:
             alternatives = _to_alternatives(pose, bar_axes, axes)
             return replace(refused, alternatives=alternatives, suspects=pose.suspects)
         turn = axes.rotation_from(bar_axes)
-        failed = pose.failed
+        failed, is_protected = pose.failed, math.isfinite(pose.hpl_m + pose.vpl_m)
         if failed is not None:
             covariance_m2 = turn @ failed.covariance_m2 @ turn.T
             failed = replace(failed, off_m=turn @ failed.off_m, covariance_m2=covariance_m2)
@@ -216,9 +216,9 @@ class Positioner:
             vpl_m=pose.vpl_m,
             excluded=pose.excluded,
             attitude_sigma_deg=math.degrees(math.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])),
-            weakest_axis=turn @ pose.along,
+            weakest_axis=turn @ pose.weakest_axis,
             standing_slope={name: turn @ slope for name, slope in pose.standing_slope.items()},
-            undetected_m=pose.hidden_m if math.isfinite(pose.hpl_m + pose.vpl_m) else np.full(3, math.inf),
+            undetected_m=pose.undetected_m if is_protected else np.full(3, math.inf),
             failed=failed,
         )
 

@@ -226,5 +226,4 @@ def _colour_pixels(
 ) -> NDArray[np.float64]:
     """Colour each pixel by its strongest cluster, paler where that is weak: float64 (rows, columns, 3)."""
     alpha = np.asarray(strength, np.float64)[..., None]
-    colour: NDArray[np.float64] = colours[np.argmax(clusters, axis=0)] * alpha + (1 - alpha)
-    return colour
+    return np.asarray(colours[np.argmax(clusters, axis=0)] * alpha + (1 - alpha))

@@ -292,8 +292,7 @@ def neighbour_residuals(t_s: NDArray[np.float64], values: NDArray[np.float64]) -
     line = middle_v + slope * (t_s - middle_t)
     # The value's own weight in the line makes its residual smaller.
     weight = 1 / count + (t_s - middle_t) ** 2 / np.maximum((dt**2).sum(1), 1e-30)
-    found: NDArray[np.float64] = (values - line) / np.sqrt(np.maximum(1 - weight, 1 / count))
-    return found
+    return np.asarray((values - line) / np.sqrt(np.maximum(1 - weight, 1 / count)))
 
 
 _NEIGHBOURS = 11

@@ -234,8 +234,7 @@ def _nearest_boundaries(
 ) -> NDArray[np.int64]:
     """The boundary that each row is nearest to in each value, int64 (values, rows); 0 and K are the ends."""
     place = (rows - (offset + fit[1] + fit[2] * when)[:, None]) / fit[0] + clusters / 2
-    nearest: NDArray[np.int64] = np.clip(np.floor(place + 0.5), 0, clusters).astype(np.int64)
-    return nearest
+    return np.asarray(np.clip(np.floor(place + 0.5), 0, clusters), np.int64)
 
 
 def _select_rows(nearest: NDArray[np.int64], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:

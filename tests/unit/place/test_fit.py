@@ -253,7 +253,7 @@ def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
         np.testing.assert_allclose(pose.standing[f"bar {b}"], -spread[:3, own], rtol=1e-6, atol=1e-9)
     together = pose.noise + pose.slow + sum(m @ m.T for m in pose.standing.values())
     np.testing.assert_allclose(together, spread[:3, :3], rtol=1e-6, atol=1e-9)
-    assert abs(np.linalg.eigh(spread[:3, :3])[1][:, -1] @ pose.along) == pytest.approx(1)
+    assert abs(np.linalg.eigh(spread[:3, :3])[1][:, -1] @ pose.weakest_axis) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("off", [0.0, 2.0, 6.0])
@@ -329,6 +329,6 @@ def test_protection_levels_hold_with_any_bar_at_fault() -> None:
         value, freedom, added, unseen = _test_fault(own, column, side, spread, np.zeros((6, 6)))
         assert value == pytest.approx(found.tests[f"bar {b}"])
         hidden = np.sqrt(stats.chi2.isf(SPEC.false_alarm / 2 / len(found.tests), freedom) * np.diag(unseen))
-        assert (found.hidden_m >= hidden * (1 - 1e-9)).all()
+        assert (found.undetected_m >= hidden * (1 - 1e-9)).all()
         height_m = hidden[2] + math.sqrt(risk * (spread[2, 2] + added[2, 2]))
         assert found.vpl_m >= height_m * (1 - 1e-9)
