@@ -30,11 +30,13 @@ def load_links(
     Raises:
         ConfigError: A file does not describe a link, or they cannot be received together.
     """
-    given: Sequence[LinkLike] = [link] if link is None or isinstance(link, Link | Path | str) else link
-    names = [one.name if isinstance(one, Link) else Path(one).stem if one else "" for one in given]
+    items: Sequence[LinkLike] = [link] if link is None or isinstance(link, Link | Path | str) else link
+    names = [item.name if isinstance(item, Link) else Path(item).stem if item else "" for item in items]
     links = tuple(
-        one if isinstance(one, Link) else load_link(one, _select_overrides(name, names, overrides), registry)
-        for one, name in zip(given, names, strict=True)
+        item
+        if isinstance(item, Link)
+        else load_link(item, _select_overrides(name, names, overrides), registry)
+        for item, name in zip(items, names, strict=True)
     )
     name_links(links)
     return links
@@ -50,10 +52,10 @@ def _select_overrides(name: str, names: Sequence[str], overrides: Sequence[str])
         if key.count(".") < 2:
             selected.append(text)
             continue
-        which = key.partition(".")[0].strip()
-        if which not in names:
-            raise ConfigError(f"--set {text}: no link is named '{which}': expected one of {', '.join(names)}")
-        if which == name:
+        owner = key.partition(".")[0].strip()
+        if owner not in names:
+            raise ConfigError(f"--set {text}: no link is named '{owner}': expected one of {', '.join(names)}")
+        if owner == name:
             selected.append(text.partition(".")[2])
     return selected
 
@@ -71,13 +73,13 @@ def name_links(link: Link | Sequence[Link]) -> dict[str, Link]:
     >>> list(name_links(load_link()))
     ['']
     """
-    given = [link] if isinstance(link, Link) else list(link)
-    if not given:
+    unnamed = [link] if isinstance(link, Link) else list(link)
+    if not unnamed:
         raise ConfigError("no link: expected one or more")
-    if len(given) == 1:
-        return {"": given[0]}
+    if len(unnamed) == 1:
+        return {"": unnamed[0]}
     links: dict[str, Link] = {}
-    for place, one in enumerate(given):
+    for place, one in enumerate(unnamed):
         name = one.name or f"link-{place}"
         if name in links:
             raise ConfigError(f"two links are named '{name}': expected another name for each file")
@@ -127,8 +129,8 @@ def find_ambiguous_links(links: Mapping[str, Link]) -> list[tuple[str, str]]:
         if ours is None or theirs is None:
             continue
         share = max(link.algorithm("framing").clock_share for link in (one, other))
-        apart = abs(one.air.chip_rate_hz / other.air.chip_rate_hz - 1)
-        if apart <= share and (_is_contained(ours, theirs) or _is_contained(theirs, ours)):
+        difference = abs(one.air.chip_rate_hz / other.air.chip_rate_hz - 1)
+        if difference <= share and (_is_contained(ours, theirs) or _is_contained(theirs, ours)):
             pairs.append((name, other_name))
     return pairs
 

@@ -39,7 +39,7 @@ def _make_lines(link: Link, registry: Registry) -> Iterator[str]:
         thing = link.algorithms.get(section) or getattr(link, section)
         cls = type(thing.shape if isinstance(thing, BarLayout) else thing)
         schema = make_model(cls).model_json_schema()["properties"]
-        yield f"# {_first_line(cls)}"
+        yield f"# {(cls.__doc__ or cls.__name__).strip().splitlines()[0]}"
         yield f"[{section}]"
         if section == "camera_sigma" and thing == cls():
             yield f"# {', '.join(schema)}: by `evlcp calibrate`; default: exact"
@@ -78,7 +78,3 @@ def _describe_key(key: str, schema: Mapping[str, Any]) -> str:
     facts = ", ".join([*([unit] if unit else []), *bounds, *choices, f"default {default}"])
     text = str(schema.get("description", "")).strip()
     return f"{text} [{facts}]" if text else f"[{facts}]"
-
-
-def _first_line(cls: type[Any]) -> str:
-    return (cls.__doc__ or cls.__name__).strip().splitlines()[0]

@@ -62,9 +62,9 @@ class LedGrid:
         """The LEDs' centres and clusters."""
         y, x = np.mgrid[: self.rows, : self.columns]
         across = self.columns // self.cluster_columns
-        which = (y // self.cluster_rows) * across + x // self.cluster_columns
+        cluster_ids = (y // self.cluster_rows) * across + x // self.cluster_columns
         place = np.stack([x - (self.columns - 1) / 2, y - (self.rows - 1) / 2, np.zeros(x.shape)], -1)
-        return place.reshape(-1, 3) * self.led_pitch_m, which.ravel()
+        return place.reshape(-1, 3) * self.led_pitch_m, cluster_ids.ravel()
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ class LedColumns:
             ],
             -1,
         )
-        which = x * (self.rows // self.cluster_rows) + y // self.cluster_rows
-        return place.reshape(-1, 3), which.ravel()
+        cluster_ids = x * (self.rows // self.cluster_rows) + y // self.cluster_rows
+        return place.reshape(-1, 3), cluster_ids.ravel()
 
 
 @dataclass(frozen=True)
@@ -224,9 +224,9 @@ class BarLayout:
 
     @cached_property
     def _leds(self) -> Leds:
-        place, which = self.shape.place_leds()
-        place.flags.writeable = which.flags.writeable = False
-        return place, which
+        place, cluster_ids = self.shape.place_leds()
+        place.flags.writeable = cluster_ids.flags.writeable = False
+        return place, cluster_ids
 
     def to_table(self) -> dict[str, Any]:
         """The layout as a link's table `[bar]`, with every default."""
@@ -260,9 +260,9 @@ class BarLayout:
 
     def cluster_positions_m(self) -> Floats:
         """Cluster centres (x right, y down, z towards the viewer), m, float64 (K, 3)."""
-        place, which = self._leds
-        count = np.bincount(which)
-        return np.stack([np.bincount(which, place[:, i]) / count for i in range(3)], -1)
+        place, cluster_ids = self._leds
+        count = np.bincount(cluster_ids)
+        return np.stack([np.bincount(cluster_ids, place[:, i]) / count for i in range(3)], -1)
 
     def cluster_centres_m(self) -> Floats:
         """Cluster centres (x right, y down) as seen from the front, m, float64 (K, 2)."""
@@ -281,13 +281,13 @@ class BarLayout:
     @cached_property
     def has_equal_clusters(self) -> bool:
         """Whether all clusters have the same LEDs about their centres, to the micrometre."""
-        place, which = self._leds
-        off = np.round((place - self.cluster_positions_m()[which]) * 1e6)
-        count = np.bincount(which)
+        place, cluster_ids = self._leds
+        offset = np.round((place - self.cluster_positions_m()[cluster_ids]) * 1e6)
+        count = np.bincount(cluster_ids)
         if (count != count[0]).any():
             return False
-        order = np.lexsort((*off.T, which))
-        forms = off[order].reshape(len(count), count[0], 3)
+        order = np.lexsort((*offset.T, cluster_ids))
+        forms = offset[order].reshape(len(count), count[0], 3)
         return bool((np.abs(forms - forms[0]) <= 1).all())
 
     @cached_property
@@ -302,14 +302,14 @@ class BarLayout:
         >>> BarLayout(bar).lit_sides.tolist(), BarLayout(panel).lit_sides.tolist()
         ([2, 3, 1], [10, 6, 11, 7, 9, 5])
         """
-        place, which = self._leds
+        place, cluster_ids = self._leds
         centres = self.cluster_centres_m()
-        size = np.array([np.ptp(place[which == k, :2], axis=0) for k in range(self.clusters)])
+        size = np.array([np.ptp(place[cluster_ids == k, :2], axis=0) for k in range(self.clusters)])
         most_m = (1 + _MOST_GAP_LEDS) * self.shape.led_m
         sides = np.zeros(self.clusters, np.int64)
-        off = centres[None] - centres[:, None]
+        offset = centres[None] - centres[:, None]
         for axis, (before, after) in ((1, (1, 2)), (0, (4, 8))):
-            along, across = off[..., axis], off[..., 1 - axis]
+            along, across = offset[..., axis], offset[..., 1 - axis]
             gap = np.abs(along) - (size[:, None, axis] + size[None, :, axis]) / 2
             touches = (np.abs(across) <= _SAME_M) & (np.abs(along) > _SAME_M) & (gap <= most_m)
             sides += before * (touches & (along < 0)).any(1)

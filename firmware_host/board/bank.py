@@ -187,11 +187,7 @@ def _make_bank(
     chips: Chips | None = None,
     rest: int | None = None,
 ) -> Bank:
-    """A bank in the most compact format for a link; without chips it is a queue.
-
-    Raises:
-        ConfigError: No board can play it.
-    """
+    """A bank in the most compact format for a link; without chips it is a queue."""
     check_rate(packet)
     clusters = int(led_clusters.max()) + 1
     if clusters != codebook.clusters:

@@ -417,23 +417,23 @@ class Board:
             VerifyError: It holds something else.
         """
         bank, s, name = self.adapt_bank(bank), self.status(), self.session.name
-        again = "'evlcp board program' brings it there"
+        advice = "'evlcp board program' brings it there"
         if s.active_bank == NO_BANK:
-            raise VerifyError(f"{name}: nothing is programmed; {again}")
+            raise VerifyError(f"{name}: nothing is programmed; {advice}")
         if not s.length:
             raise VerifyError(
-                f"{name}: its bank is the queue of a stream, which holds nothing to compare; {again}"
+                f"{name}: its bank is the queue of a stream, which holds nothing to compare; {advice}"
             )
         self.check_same_air(bank, s)
         difference = self._find_difference(bank, s)
         if difference is not None:
-            raise VerifyError(f"{name}: holds other packets: {difference}; {again}")
+            raise VerifyError(f"{name}: holds other packets: {difference}; {advice}")
         held = self.read_bank(s.active_bank, 0, s.length)
         wrong = next((i for i, (a, b) in enumerate(zip(held, bank.content, strict=True)) if a != b), None)
         if wrong is not None:
             raise VerifyError(
                 f"{name}: byte {wrong} of bank {s.active_bank} is {held[wrong]:#04x},"
-                f" expected {bank.content[wrong]:#04x}; {again}"
+                f" expected {bank.content[wrong]:#04x}; {advice}"
             )
         return s.active_bank
 

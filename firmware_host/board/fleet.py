@@ -28,7 +28,7 @@ from firmware_host.protocol.generated.requests import DEFAULT_BAUD, Watchdog
 
 
 @dataclass(frozen=True)
-class Entry:
+class FleetEntry:
     """One board of an inventory: its payload and `Settings`; paths are relative to the inventory's.
 
     Attributes:
@@ -111,7 +111,7 @@ class Inventory:
     """The boards of a file, and the bank of each by its id."""
 
     path: Path
-    entries: tuple[Entry, ...]
+    entries: tuple[FleetEntry, ...]
     banks: Mapping[str, Bank]
 
 
@@ -128,7 +128,7 @@ def read_inventory(path: Path) -> Inventory:
     return Inventory(path, entries, banks)
 
 
-def read_entries(path: Path) -> tuple[Entry, ...]:
+def read_entries(path: Path) -> tuple[FleetEntry, ...]:
     """Read the boards of an inventory: `[[board]]` tables, and `[defaults]` with any key of a board.
 
     Raises:
@@ -143,7 +143,7 @@ def read_entries(path: Path) -> tuple[Entry, ...]:
     for i, row in enumerate(tables.board):
         place = f"{path}: board[{i}]"
         try:
-            entries.append(build_spec(Entry, tables.defaults | row))
+            entries.append(build_spec(FleetEntry, tables.defaults | row))
         except SpecError as fault:
             raise ConfigError("\n".join(fault.lines(f"{place}."))) from fault
         except ConfigError as fault:
@@ -161,7 +161,7 @@ def read_entries(path: Path) -> tuple[Entry, ...]:
     return tuple(entries)
 
 
-def _load_bank(path: Path, index: int, entry: Entry, registry: Registry) -> Bank:
+def _load_bank(path: Path, index: int, entry: FleetEntry, registry: Registry) -> Bank:
     folder, given, named = path.parent, None, entry.link
     try:
         if isinstance(named, str):
@@ -185,7 +185,7 @@ def _load_bank(path: Path, index: int, entry: Entry, registry: Registry) -> Bank
         raise kind("\n".join(f"{place}: {line}" for line in str(fault).splitlines())) from fault
 
 
-def _message_bank(folder: Path, entry: Entry, link: Link) -> Bank:
+def _message_bank(folder: Path, entry: FleetEntry, link: Link) -> Bank:
     site = None
     if entry.beacon is not None:
         site = choose_site(folder / entry.beacon, entry.transmitter_id, "transmitter_id")
@@ -202,7 +202,7 @@ def _message_bank(folder: Path, entry: Entry, link: Link) -> Bank:
 
 
 @contextlib.contextmanager
-def open_entry(entry: Entry, folder: Path) -> Iterator[Board]:
+def open_entry(entry: FleetEntry, folder: Path) -> Iterator[Board]:
     """Open the board of an inventory's entry; paths are relative to the folder.
 
     Raises:
@@ -223,14 +223,14 @@ def open_entry(entry: Entry, folder: Path) -> Iterator[Board]:
         yield board
 
 
-Work = Callable[[Entry, Board], tuple[str, dict[str, Any]]]
+Work = Callable[[FleetEntry, Board], tuple[str, dict[str, Any]]]
 """Works on a board; returns the result as text and as plain values."""
 
 Report = Callable[[str, dict[str, Any]], None]
 """Called with each board's result when it is done: a line of text, and plain values."""
 
 
-def run_fleet(path: Path, entries: Sequence[Entry], work: Work, report: Report) -> None:
+def run_fleet(path: Path, entries: Sequence[FleetEntry], work: Work, report: Report) -> None:
     """Work on all boards of an inventory at once; one that fails does not stop the others.
 
     Raises:
@@ -238,7 +238,7 @@ def run_fleet(path: Path, entries: Sequence[Entry], work: Work, report: Report) 
     """
     codes: dict[str, int] = {}
 
-    def run_entry(entry: Entry) -> tuple[str, dict[str, Any]]:
+    def run_entry(entry: FleetEntry) -> tuple[str, dict[str, Any]]:
         start = time.monotonic()
         table, code, fault = dict[str, Any](), 0, None
         try:
@@ -268,7 +268,7 @@ def run_fleet(path: Path, entries: Sequence[Entry], work: Work, report: Report) 
 def program_fleet(inventory: Inventory, verify: bool, report: Report) -> None:
     """Program all boards at once; errors as of `run_fleet`."""
 
-    def work(entry: Entry, board: Board) -> tuple[str, dict[str, Any]]:
+    def work(entry: FleetEntry, board: Board) -> tuple[str, dict[str, Any]]:
         start = time.monotonic()
         done = provision(board, inventory.banks[entry.id], entry.settings, verify)
         table = {"written_bytes": done.written, "swapped": done.swapped}

@@ -84,12 +84,12 @@ def packet_s(link: Link) -> float:
 
 def check_interval(content: Content, link: Link, repeat: int, every_s: float) -> None:
     """Raise ConfigError if messages take longer on air than the period in which they are sent."""
-    many = len(encode_messages(content.messages_at(link, clock_s(), 0), link.block_coder(), repeat))
-    takes_s = many * packet_s(link)
+    count = len(encode_messages(content.messages_at(link, clock_s(), 0), link.block_coder(), repeat))
+    takes_s = count * packet_s(link)
     if takes_s > every_s:
         raise ConfigError(
             f"--every {every_s:g}: what is to be sent takes {takes_s:.4g} s on air,"
-            f" {many} packets of {1e3 * packet_s(link):.4g} ms;"
+            f" {count} packets of {1e3 * packet_s(link):.4g} ms;"
             f" give --every {ceil(takes_s)} or more, or send less"
         )
 
@@ -111,8 +111,8 @@ def send_periodically(
 
     def make_packets(number: int) -> Iterator[NDArray[np.int64]] | None:
         at_s = clock_s() + stream.delay_s
-        over = content.ends_s is not None and number and at_s > content.ends_s + every_s
-        if over or (count is not None and number >= count):
+        is_over = content.ends_s is not None and number and at_s > content.ends_s + every_s
+        if is_over or (count is not None and number >= count):
             return None
         return iterate_packets(content.messages_at(link, at_s, number), coder, repeat)
 

@@ -140,7 +140,7 @@ class Session:
             RefusedError: It has another key than this host.
         """
         self.client.session = protocol.NO_SESSION
-        self.client.sealer, known = None, self.client.sealer
+        self.client.sealer, old_sealer = None, self.client.sealer
         self.client.window = 1
         self.client.minor = MINOR
         found: list[RequestOutcome] = []
@@ -167,7 +167,7 @@ class Session:
         self.client.session = outcome.reply.session
         self.client.window = max(1, outcome.reply.window)
         self.max_payload = outcome.reply.max_payload
-        self._agree_on_key(outcome.reply, outcome.token, known)
+        self._agree_on_key(outcome.reply, outcome.token, old_sealer)
         self.client.minor = min(MINOR, outcome.reply.minor)
         return outcome.reply
 
@@ -176,7 +176,7 @@ class Session:
         self._nonce = (self._nonce + 1) & 0xFFFFFFFF
         return self.hello()
 
-    def _agree_on_key(self, info: protocol.HelloReply, token: int, known: Sealer | None) -> None:
+    def _agree_on_key(self, info: protocol.HelloReply, token: int, old_sealer: Sealer | None) -> None:
         """Seal further requests if both ends have the board's key; without it only its state can be read."""
         if not any(info.key_name) or self.key is None:
             return
@@ -189,8 +189,8 @@ class Session:
             )
         # numbers begin with that of the session's HELLO
         start = ((self.client.first + token) & 0xFFFF) - token
-        same = known is not None and known.challenge == info.challenge
-        self.client.sealer = known if same else Sealer(self.key, info.challenge, start)
+        same = old_sealer is not None and old_sealer.challenge == info.challenge
+        self.client.sealer = old_sealer if same else Sealer(self.key, info.challenge, start)
         self.max_payload = info.max_payload - protocol.SEAL_BYTES
 
     def call(self, request: WireRequest[Reply]) -> Reply:
@@ -270,13 +270,13 @@ class Session:
         """
         source = iter(requests)
         sent: dict[int, Request] = {}
-        more = True
+        has_more = True
         try:
-            while sent or more:
-                while more and self.client.has_room:
+            while sent or has_more:
+                while has_more and self.client.has_room:
                     request = next(source, None)
                     if request is None:
-                        more = False
+                        has_more = False
                     else:
                         self._check_supported(request)
                         sent[self.client.submit(request)] = request

@@ -57,8 +57,8 @@ class UpdatePackage:
             table = read_json(path)
             images = {n: base64.b64decode(table["images"][str(n)], validate=True) for n in (1, 2)}
             crcs = [zlib.crc32(images[n]) for n in (1, 2)]
-            good = table["evlcp_update"] == 1 and crcs == table["crc32"] and all(images.values())
-            if not good or not isinstance(table["target"], str):
+            is_valid = table["evlcp_update"] == 1 and crcs == table["crc32"] and all(images.values())
+            if not is_valid or not isinstance(table["target"], str):
                 raise ValueError
         except (InputError, KeyError, TypeError, ValueError) as fault:
             if isinstance(fault.__cause__, OSError):

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from firmware_host.board.bank import Bank
     from firmware_host.board.board import Board
-    from firmware_host.board.fleet import Entry
+    from firmware_host.board.fleet import FleetEntry
     from firmware_host.board.monitor import BoardGone, BoardReturned, KeyMissing
     from firmware_host.protocol.generated.requests import StatusReply
 
@@ -215,7 +215,7 @@ def _run_on_boards(
     context: typer.Context,
     inventory: Path | None,
     as_json: bool,
-    work: Callable[[Entry | None, Board], tuple[str, dict[str, Any]]],
+    work: Callable[[FleetEntry | None, Board], tuple[str, dict[str, Any]]],
     *allowed: str,
 ) -> None:
     """Work on a board, or on all of an inventory, and print the results.
@@ -353,7 +353,7 @@ def _change_state(
     context: typer.Context, inventory: Path | None, as_json: bool, ask: Callable[[Board], Any], state: str
 ) -> None:
 
-    def work(_: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
+    def work(_: FleetEntry | None, board: Board) -> tuple[str, dict[str, Any]]:
         ask(board)
         return state if inventory else "", {"state": state}
 
@@ -403,7 +403,7 @@ def status(context: typer.Context, inventory: InventoryFile = None, as_json: AsJ
             _print_table(status_table(board.status()), as_json)
         return
 
-    def work(_: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
+    def work(_: FleetEntry | None, board: Board) -> tuple[str, dict[str, Any]]:
         found = status_table(board.status())
         faults = f", faults {', '.join(found['faults'])}" if found["faults"] else ""
         return f"{found['state']}, {found['packets_sent']} packets sent{faults}", {"status": found}
@@ -442,7 +442,7 @@ def monitor(
 
 def _watch_fleet(
     path: Path,
-    entries: Sequence[Entry],
+    entries: Sequence[FleetEntry],
     interval: float,
     count: int | None,
     reconnect: bool,
@@ -463,7 +463,7 @@ def _watch_fleet(
 
     ended, printing = threading.Event(), threading.Lock()
 
-    def watch_entry(entry: Entry) -> None:
+    def watch_entry(entry: FleetEntry) -> None:
         for event in watch_board(
             partial(open_entry, entry, path.parent), interval, count, reconnect, reconnect, ended
         ):
@@ -535,7 +535,7 @@ def verify(
         _check_inventory_options(context)
         banks = read_inventory(inventory).banks
 
-    def compare(entry: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
+    def compare(entry: FleetEntry | None, board: Board) -> tuple[str, dict[str, Any]]:
         bank = banks[entry.id if entry else ""]
         number = board.verify(bank)
         table = {"bytes": len(bank.content), "bank": number, "crc": f"{bank.crc:08x}"}
@@ -576,7 +576,7 @@ def save(
     For example: [bold]evlcp board --port /dev/ttyUSB0 save --autostart[/]
     """
 
-    def work(_: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
+    def work(_: FleetEntry | None, board: Board) -> tuple[str, dict[str, Any]]:
         reply = board.save(autostart)
         table = {"slot": reply.slot, "save_sequence": reply.save_sequence, "autostart": autostart}
         return f"saved in slot {reply.slot}, number {reply.save_sequence}", table

@@ -192,12 +192,12 @@ def message(
             raise ConfigError("--every sends what changes, to a board: -o and --chips hold what stays")
         _send_periodically(made, link, board.line(), repeat, anew, as_json=as_json)
         return
-    symbols, summary = _encode(made, link, repeat)
+    symbols, summary = _encode_content(made, link, repeat)
     table = symbols_table(symbols, link, messages=True)
     _write_files(symbols, link, table, out, chips)
     written = [str(path) for path in (out, chips) if path is not None]
     line = board.line(only_named=bool(written))
-    text = _describe(summary, written)
+    text = _describe_summary(summary, written)
     if line is None:
         print_result(text, summary | {"board": None} | table, as_json)
         if not written and not as_json:
@@ -248,7 +248,7 @@ def _send_periodically(
     print_stream_result(stream, as_json)
 
 
-def _encode(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int64], dict[str, Any]]:
+def _encode_content(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int64], dict[str, Any]]:
     """Symbols of the packets with the content now, and a summary of its messages."""
     from time import time as clock_s
 
@@ -272,7 +272,7 @@ def _encode(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int64
     }
 
 
-def _describe(summary: dict[str, Any], written: list[str]) -> str:
+def _describe_summary(summary: dict[str, Any], written: list[str]) -> str:
     lines = [
         f"{m['kind']:9} {m['bytes']:5} bytes, transmitter {m['transmitter_id']}, sequence {m['sequence']}"
         for m in summary["messages"]

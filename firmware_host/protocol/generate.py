@@ -82,12 +82,12 @@ _NUMBERS = {
 """Numbers of the definition that become constants of the Python module."""
 
 
-def _camel(name: str) -> str:
+def _to_camel_case(name: str) -> str:
     return _CLASSES.get(name) or "".join(part.capitalize() for part in name.split("_"))
 
 
 def _reply_class(message: Table) -> str:
-    return f"{_camel(message['name'])}Reply" if message["reply"] else "EmptyReply"
+    return f"{_to_camel_case(message['name'])}Reply" if message["reply"] else "EmptyReply"
 
 
 def _with_offsets(fields: list[Table]) -> list[tuple[Table, int]]:
@@ -116,7 +116,7 @@ _TEMPLATES = Environment(
     keep_trailing_newline=True,
 )
 _TEMPLATES.filters |= {
-    "camel": _camel,
+    "camel": _to_camel_case,
     "reply_class": _reply_class,
     "with_offsets": _with_offsets,
     "fields_table": _fields_table,
@@ -124,7 +124,7 @@ _TEMPLATES.filters |= {
 }
 
 
-def render(template: str, definition: Table) -> str:
+def render_template(template: str, definition: Table) -> str:
     """A generated file: `requests.py`, `profiles.py`, `protocol.h`, `profiles.h` or `protocol.md`.
 
     Raises:
@@ -160,12 +160,12 @@ def render_files() -> dict[Path, str]:
     definition = tomllib.loads((HERE / "protocol" / "protocol.toml").read_text())
     headers, modules = HERE / "firmware" / "generated", HERE / "protocol" / "generated"
     places = {"requests.py": modules, "profiles.py": modules, "protocol.h": headers, "profiles.h": headers}
-    files = {folder / name: render(name, definition) for name, folder in places.items()}
+    files = {folder / name: render_template(name, definition) for name, folder in places.items()}
     files[headers / "codebook.h"] = resolve({}).codebook.to_c()
     page = HERE.parent / "docs" / "protocol.md"
     if page.exists():  # in a checkout; an installed package has no docs
         head = page.read_text().partition(_MARK)[0]
-        files[page] = head + _MARK + render("protocol.md", definition)
+        files[page] = head + _MARK + render_template("protocol.md", definition)
     return files
 
 

@@ -66,11 +66,11 @@ def test_file_of_symbols_is_one(evlcp, tmp_path):
 
 
 def test_every_command_and_every_key_of_an_inventory_is_reported():
-    from firmware_host.board.fleet import Entry
+    from firmware_host.board.fleet import FleetEntry
     from firmware_host.commands.board import app
 
     table = PAGE.split("| command | does |")[1].split("\n\n")[0]
     names = [command.name or command.callback.__name__ for command in app.registered_commands]
     assert [name for name in names if f"`{name}" not in table] == []
     section = PAGE.split("## Many boards")[1].split("## Emulated")[0]
-    assert [field.name for field in fields(Entry) if field.name not in section] == []
+    assert [field.name for field in fields(FleetEntry) if field.name not in section] == []

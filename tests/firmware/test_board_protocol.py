@@ -43,11 +43,11 @@ def test_what_comes_later_stands_at_the_end():
     table = definition()
     table["message"][1]["request"][0]["since"] = 1
     with pytest.raises(ValueError, match="configure: a field with `since` stands before one without"):
-        generate.render("protocol.h", table)
+        generate.render_template("protocol.h", table)
     table = definition()
     table["message"][3]["request"][-1]["since"] = 1
     with pytest.raises(ValueError, match="write: a field of any length"):
-        generate.render("requests.py", table)
+        generate.render_template("requests.py", table)
 
 
 @pytest.mark.parametrize(
