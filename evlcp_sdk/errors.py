@@ -139,7 +139,6 @@ def _first_line(fault: BaseException) -> str:
 
 
 def _report_line(fault: BaseException) -> str:
-    """What happened, where, and with which versions."""
     import platform
     import traceback
     from importlib.metadata import version

@@ -218,7 +218,6 @@ class Outputs:
         return self
 
     def __exit__(self, *_fault: object) -> None:
-        """Remove what `commit` has not brought into place."""
         self.discard()
 
 
@@ -249,11 +248,7 @@ def _is_special(path: Path) -> bool:
 
 
 def check_output(path: Path, *, regular: bool = True) -> None:
-    """Check before the work that a file can be written here.
-
-    Args:
-        path: The file; it need not exist.
-        regular: Refuse a pipe or a terminal.
+    """Check before the work that a file can be written here; a `regular` one is no pipe or terminal.
 
     Raises:
         OutputError: A link, a folder or a device is in its place.
@@ -454,11 +449,8 @@ def read_table(
 ) -> tuple[list[int], dict[str, "NDArray[Any]"]]:
     """Read the line of each row of a CSV file, and its columns of numbers, float64 (n,) each, n >= 1.
 
-    Args:
-        path: The file.
-        needed: Required columns, and the range of their numbers.
-        optional: The same of optional columns.
-        rising: The column whose numbers must rise from line to line, as times do.
+    `needed` and `optional` are columns with the range of their numbers; those of `rising` must rise from line
+    to line, as times do.
 
     Raises:
         InputError: The file cannot be read, or is not CSV.

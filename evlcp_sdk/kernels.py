@@ -24,13 +24,9 @@ _REPORT_EVERY_S = 10.0
 
 
 class CompileTimer:
-    """Time spent in this process on compiling kernels, and on loading cached ones.
+    """Time spent in this process on compiling kernels and loading cached ones: of processors and elapsed, s.
 
     Compiling that takes long is logged, with its progress; loading is not.
-
-    Attributes:
-        processor_s: Processor time, s.
-        elapsed_s: Wall-clock time, s.
     """
 
     def __init__(self) -> None:
@@ -134,11 +130,8 @@ def njit(**options: Any) -> Callable[[F], F]: ...
 def njit(function: Any = None, /, **options: Any) -> Any:
     """As `numba.njit`, without the GIL, and cached; compiled in each process where no folder can be written.
 
-    A division by 0 gives what NumPy gives, which is quicker to compile than an error. C calls none of them.
-
-    Args:
-        function: Compiled at its first call.
-        options: Further options of `numba.njit`.
+    The function is compiled at its first call. A division by 0 gives what NumPy gives, which is quicker to
+    compile than an error. C calls none of them.
     """
     all_options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True} | options
     return (lambda f: _Kernel(f, all_options)) if function is None else _Kernel(function, all_options)

@@ -103,7 +103,6 @@ def receive(
 
 
 def _source_name(source: EventSource | str | Path, opened: EventSource) -> str:
-    """The name of a source in messages and the summary."""
     return str(opened.path if isinstance(source, EventSource) or source == STDIN else source)
 
 
@@ -491,7 +490,6 @@ def _run_to_end(
 def _build_tables(
     source: EventSource, url: str, watch: Stopwatch, first_us: int | None, last_us: int | None
 ) -> dict[str, dict[str, Any]]:
-    """The summary's tables of a recording, and of its processing."""
     recording = summarize_source(source, url, first_us, last_us)
     recording |= {"guessed": source.guessed, "step_us": source.step_us}
     duration_s = recording["duration_s"]

@@ -90,10 +90,8 @@ class EndRequest:
 def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[EndRequest]:
     """Let Ctrl-C, SIGTERM or SIGHUP end a run after the current piece; a second one ends it at once.
 
-    Gives the `stopped` of `receive_to_folder`. Only the main thread receives signals.
-
-    Args:
-        pass_on: Called at the first one, to notify others.
+    Gives the `stopped` of `receive_to_folder`; the first signal calls `pass_on`, to notify others. Only the
+    main thread receives signals.
     """
     end = EndRequest()
 

@@ -105,7 +105,6 @@ def _describe_error(
 
 
 def _list_keys(cls: type[Any], path: Sequence[str]) -> list[str]:
-    """The keys of the dataclass at a path within another."""
     for part in path:
         if not part.isdigit():
             inner = _find_dataclass(get_type_hints(cls).get(part))

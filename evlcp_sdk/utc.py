@@ -58,12 +58,10 @@ class PulseClock:
         self.counts = {"pulses": 0, "pulses_rejected": 0}
 
     def add(self, triggers: Triggers, now_s: float, now_us: float) -> None:
-        """Add the next triggers.
+        """Add the next triggers, in order of time.
 
-        Args:
-            triggers: In order of time.
-            now_s: UTC since 1970 by the computer's clock, s.
-            now_us: The camera's clock at that time, us.
+        `now_s` is UTC since 1970 by the computer's clock, s, and `now_us` the camera's clock at that time,
+        us.
         """
         rising = triggers.value == 1
         pulses = rising & (triggers.channel == self.channel)

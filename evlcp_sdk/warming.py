@@ -36,8 +36,7 @@ class WarmUpResult:
 def warm_up(advance: Callable[[str], None] = lambda _step: None) -> WarmUpResult:
     """Simulate and receive a fifth of a second with the default link; later processes find its kernels.
 
-    Args:
-        advance: Called with the name of a step of `STEPS` when it begins.
+    `advance` is called with the name of a step of `STEPS` when it begins.
     """
     compiled_before, start_s = count_compiled(), time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="evlcp-warm-up-") as name:

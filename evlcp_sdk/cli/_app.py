@@ -108,11 +108,7 @@ def _prepare_command(command: Any) -> None:
 
 
 def make_app(*modules: str) -> typer.Typer:
-    """The command line with the built-in commands; plugins add theirs by `evlcp_register_commands`.
-
-    Args:
-        modules: Names of `_BUILT_IN` to take; none for all.
-    """
+    """The command line with these of the built-in commands, by default all; plugins add theirs later."""
     app = typer.Typer(
         name="evlcp",
         cls=_Commands,
@@ -147,13 +143,11 @@ def add_plugin_commands(app: typer.Typer, registry: "Registry") -> None:
 
 
 def _command_names(app: typer.Typer) -> set[str]:
-    """Names of an app's commands and groups."""
     commands = {_command_name(command) for command in app.registered_commands}
     return commands | {group.name or "" for group in app.registered_groups}
 
 
 def _command_name(command: CommandInfo) -> str:
-    """The name that Typer gives a command."""
     return command.name or str(getattr(command.callback, "__name__", "")).lower().replace("_", "-")
 
 

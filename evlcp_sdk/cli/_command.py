@@ -12,7 +12,6 @@ from evlcp_sdk.cli._common import echo
 
 
 def _show_full_help(ctx: typer.Context, show: bool) -> None:
-    """Show a command's help with its hidden options, and end."""
     if not show:
         return
     for parameter in ctx.command.params:

@@ -59,8 +59,6 @@ def print_json(value: object, indent: int | None = None) -> None:
 
 
 class _StderrHandler(logging.Handler):
-    """Prints the SDK's log on stderr."""
-
     def emit(self, record: logging.LogRecord) -> None:
         print_stderr(record.getMessage())
 

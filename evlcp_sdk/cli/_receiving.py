@@ -263,7 +263,7 @@ class LinePrinter:
 
     Attributes:
         closed: One of these has happened.
-        failed: Standard output has failed, which was reported: the exit code is 1.
+        failed: Standard output has failed, which was reported.
     """
 
     def __init__(self) -> None:

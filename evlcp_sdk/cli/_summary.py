@@ -78,7 +78,6 @@ def print_summary(summary: dict[str, Any], folder: Path | None, *, stderr: bool 
 
 
 def _print_transmitters(summary: Mapping[str, Any], out: "Console") -> None:
-    """Print a row for each transmitter, and their texts."""
     from rich.text import Text
 
     if summary["transmitters"]:
@@ -158,13 +157,11 @@ def _format_transmitter(figures: Mapping[str, Any]) -> str:
 
 
 def _format_erased(figures: Mapping[str, Any]) -> str:
-    """The share of symbols that are not given."""
     erased = figures["symbols_erased"]
     return f"{erased / (erased + figures['symbols_given']):.1%}" if erased else "-"
 
 
 def _describe_positions(positions: Mapping[str, Any]) -> str:
-    """The number of positions, and why there are not more, in one line."""
     text = format_count(positions["fixes"], "position")
     if positions["fixes_verified"]:
         text += f", {positions['fixes_verified']} verified"

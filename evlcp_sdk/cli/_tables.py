@@ -15,14 +15,9 @@ _GAP = 2
 def print_table(
     out: "Console", head: Sequence[str], rows: Iterable[Sequence[str]], names: int = 1, best: str = "\0"
 ) -> None:
-    """Print a table; columns beyond the screen's width follow below.
+    """Print a table; columns beyond the screen's width follow below, after the first `names` columns again.
 
-    Args:
-        out: The console.
-        head: Titles of the columns.
-        rows: Texts of each row.
-        names: Number of first columns that name a row; every part of the table has them.
-        best: End of texts that are printed in bold type.
+    Texts that end with `best` are printed in bold type.
     """
     from rich.table import Table
     from rich.text import Text
@@ -45,7 +40,6 @@ def print_table(
 
 
 def _split_columns(columns: Sequence[Sequence[str]], names: int, width: int) -> Iterator[list[Sequence[str]]]:
-    """Split columns into parts that fit, each with the columns of names."""
     part = list(columns[:names])
     for column in columns[names:]:
         if len(part) > names and _total_width([*part, column]) > width:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -56,21 +56,20 @@ def calibrate(
         recordings, bars, known, link, registry=registry, limit_px=limit_px, name=str(poses)
     )
     if as_json:
-        print_json(_to_dict(found) | {"poses": len(known)})
+        print_json(
+            {
+                "camera": {name: getattr(found.camera, name) for name in found.sigma},
+                "sigma": dict(found.sigma),
+                "camera_sigma": asdict(found.camera_sigma),
+                "not_determined_corner_px": dict(found.undetermined_px),
+                "views": found.views,
+                "points": found.points,
+                "misfit": found.misfit,
+                "poses": len(known),
+            }
+        )
     else:
         console().print(_to_toml(found, len(known)))
-
-
-def _to_dict(found: CalibrationResult) -> dict[str, Any]:
-    return {
-        "camera": {name: getattr(found.camera, name) for name in found.sigma},
-        "sigma": dict(found.sigma),
-        "camera_sigma": asdict(found.camera_sigma),
-        "not_determined_corner_px": dict(found.undetermined_px),
-        "views": found.views,
-        "points": found.points,
-        "misfit": found.misfit,
-    }
 
 
 def _to_toml(found: CalibrationResult, poses: int) -> str:

@@ -145,7 +145,6 @@ def _describe_outcome(outcome: Verdict) -> dict[str, str]:
 def _build_link(
     role: str, id: str, link_file: str | None, overrides: Sequence[str], registry: Registry
 ) -> Link:
-    """The link with the algorithm in its role."""
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.link.resolve import load_link, resolve
     from evlcp_sdk.plugin.roles import STEPS

@@ -77,7 +77,6 @@ def compare(
 
 
 def _check_outputs(out: Sequence[Path]) -> None:
-    """Check before the work that tables can be written here."""
     from evlcp_sdk.files import check_output
 
     for path in out:
@@ -146,7 +145,6 @@ def _compare_recordings(
 
 
 def _compare_recording(url: str, *, variants: tuple[Variant, ...], here: bool) -> Table:
-    """Compare the variants on one recording, here or in a worker."""
     from evlcp_sdk.study.compare import compare_recording
 
     with bytes_bar(Path(url).name) if here else nullcontext() as advance:

@@ -174,7 +174,6 @@ def _serve(
     plan: PositionPlan | None,
     clock: ClockZero,
 ) -> Iterator[None]:
-    """Serve, and print the addresses."""
     from evlcp_sdk.link.several import name_links
     from evlcp_sdk.live.services import serve
 
@@ -187,7 +186,6 @@ def _serve(
 
 
 def _open_reconnecting(url: str, registry: Registry, stopped: Stopped) -> EventSource:
-    """Open a source that is opened again whenever it ends by a fault."""
     from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.reconnect import ReconnectingSource
 

@@ -72,7 +72,6 @@ def _interrupt_next_call(_frame: object, event: str, _of: object) -> None:
 
 
 def _report_fault(fault: BaseException) -> int:
-    """Print what went wrong; return the exit code."""
     from evlcp_sdk.errors import explain_fault
 
     # Only stdout has no name here.

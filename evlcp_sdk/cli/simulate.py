@@ -80,7 +80,6 @@ def _list_presets(*, as_json: bool) -> None:
 
 
 def _choose_source(scene_file: str | None, preset: str | None) -> Path | str:
-    """The path of a scene's file, or the name of a preset."""
     from evlcp_sdk.files import path_exists
     from evlcp_sdk.sim import preset_names, preset_text
 
@@ -107,7 +106,6 @@ def _render(
     *,
     as_json: bool,
 ) -> None:
-    """Render a scene into files, and print a summary."""
     import time
 
     from evlcp_sdk.errors import ConfigError

@@ -73,7 +73,6 @@ def survey(
 
 
 def _write(found: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None:
-    """Write the sites, and print them."""
     from dataclasses import asdict
 
     from evlcp_sdk.files import Outputs

@@ -82,7 +82,6 @@ def sweep(
 
 
 def _print_progress(name: str, progress: Progress, written: Path | None) -> None:
-    """Print the progress of a campaign, and the place of its results."""
     screen = console()
     screen.print(
         f"{name}: {progress.done} of {progress.tasks} tasks,"

@@ -191,7 +191,6 @@ def _try_links(
     link: Link,
     registry: Registry,
 ) -> Iterator[Trial]:
-    """Try links on a sample of a recording, the given one first."""
     start, fits = _cut_trial_events(sample), False
     # Changes are tried only of links whose packets have a preamble.
     if "preambles" in recording.receiver.counts and sources:
@@ -214,9 +213,6 @@ class _RecordingPass:
     """One pass of a recording through a survey and a receiver.
 
     Attributes:
-        survey: The survey of its light.
-        receiver: A receiver of the link.
-        tally: Figures of its transmitters.
         pieces: Its first events, or those around the receiver's first region.
         has_regions: The receiver has opened a region.
     """

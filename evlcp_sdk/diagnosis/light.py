@@ -148,8 +148,7 @@ class LightSurvey:
         cell_px: Size of the cells in which the events are counted, px.
         readout: Events in each millisecond.
         signs: Negative and positive events of each cell, int64 (rows, columns, 2).
-        first_us: Time of the first event, camera clock, us; NaN before.
-        last_us: Time of the last one, us.
+        first_us, last_us: Times of the first event and the last, camera clock, us; NaN before.
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -284,7 +283,6 @@ class LightSurvey:
         return left, top, min(right, self.width), min(bottom, self.height)
 
     def _measure_size(self, box: tuple[int, int, int, int]) -> tuple[float, float]:
-        """Width and height of the light in a box, the median of the windows that show it, px."""
         left, top, _, _ = box
         sizes = []
         for window in self._windows:

@@ -128,7 +128,6 @@ def check_sites(facts: Facts) -> Findings:
 
 
 def _list_ids(ids: Sequence[int]) -> str:
-    """Ids in words, the first ones listed; empty for none."""
     more = f" and {len(ids) - _MAX_IDS} more" if len(ids) > _MAX_IDS else ""
     return f"id{'s' * (len(ids) > 1)} {', '.join(map(str, ids[:_MAX_IDS]))}{more}" if ids else ""
 

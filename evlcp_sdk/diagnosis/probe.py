@@ -47,12 +47,10 @@ class Trial:
 
     Attributes:
         changes: Its differences to the given link: `table.key` and value.
-        link: The link.
-        frames: Number of accepted frames.
-        rejected: Number of rejected ones.
+        frames, rejected: Numbers of accepted and of rejected frames.
         quality: Mean quality of the frames; 0 without any.
-        never: Codewords that never occur though they should have, by far.
-        explanation: What a framing says of the light by which it was inferred, or why it was not.
+        missing_codewords: Codewords that never occur though they should have, by far.
+        explanation: How a framing inferred the link from light, or why it did not.
     """
 
     changes: tuple[tuple[str, Any], ...]

@@ -64,13 +64,7 @@ class MillisecondHistogram:
 
 
 class ReadoutTally:
-    """Histograms of the events, and of the rows read, in a millisecond.
-
-    Attributes:
-        grain: How coarse the times are.
-        events: Events of the milliseconds with any.
-        rows: Rows read in some of these.
-    """
+    """Histograms of the events in a millisecond, and of the rows read in some; and the grain of the times."""
 
     def __init__(self) -> None:
         self.grain = TimeGrain()

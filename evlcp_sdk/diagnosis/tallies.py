@@ -250,10 +250,7 @@ def count_missing_codewords(one: TransmitterTally, link: Link) -> int:
 
 
 class RunTally:
-    """Running figures of all transmitters.
-
-    Args:
-        form: Lengths of a packet's parts; of several links, by the name of each.
+    """Running figures of all transmitters, by the lengths of a packet's parts, or these by the link's name.
 
     Attributes:
         transmitters: Figures by number.

@@ -67,11 +67,7 @@ class Budget:
 
 
 class Shedder:
-    """Leaves events out by the level of shedding, and counts them.
-
-    Args:
-        width: Columns of the sensor.
-        height: Its rows.
+    """Leaves events of a sensor of this size out by the level of shedding.
 
     Attributes:
         counts: Events left out: of `rows_outside_regions`, of `empty_areas`, and `too_late`.

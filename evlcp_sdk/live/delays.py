@@ -10,11 +10,7 @@ _CELLS_PER_E: Final = 50
 
 
 class DelayTally:
-    """Delays counted in cells of 2 %, from 1 us to a million ms.
-
-    Attributes:
-        count: Number of delays.
-        max_ms: The longest, ms; 0 before the first.
+    """Delays counted in cells of 2 %, from 1 us to a million ms; their number, and the longest, ms.
 
     >>> tally = DelayTally()
     >>> for delay_ms in (1.0, 2.0, 3.0, 40.0):

@@ -73,13 +73,8 @@ class LiveStatus:
 class LiveLoop:
     """Reads a source in real time, feeds the receiver, and publishes the results.
 
-    Args:
-        source: The source; not closed.
-        receiver: The receiver; it passes each frame to `publish_frame`.
-        links: Its links.
-        publisher: Takes results and pictures.
-        budget: When to shed what.
-        pulses: Takes triggers, which give the UTC of the camera's clock; None for none.
+    The receiver passes each frame to `publish_frame`; `pulses` get the triggers, which give the UTC of the
+    camera's clock. The source is not closed.
 
     Attributes:
         delays: Delays of frames, by stage; `end_to_end` of messages `time`.
@@ -256,7 +251,6 @@ class LiveLoop:
         self._recent[stage].add(delay_ms)
 
     def _publish_status(self, *, now: bool = False) -> None:
-        """Publish the status where it is due."""
         at_s = time.monotonic()
         since_s = at_s - self._status_s
         if (since_s < _STATUS_EVERY_S and not now) or not self._publisher.has_listeners("status"):
@@ -281,6 +275,5 @@ class LiveLoop:
 
 
 def _span_us(pieces: list[Slice]) -> int:
-    """From the first event of some slices to their last, us."""
     times_us = [one.events.t_us for one in pieces if len(one.events)]
     return int(times_us[-1][-1] - times_us[0][0]) if times_us else 0

@@ -16,14 +16,11 @@ WINDOW_US = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """The events of `WINDOW_US`, and the regions in it.
+    """The events of `WINDOW_US`, and the receiver's regions in them, of a sensor of this size.
 
     Attributes:
         t_us: Its end on the camera's clock, us.
         pieces: Its events; the first piece may begin with older ones.
-        width: Width of the sensor, px.
-        height: Its height, px.
-        regions: The receiver's regions.
         number: Its number, from 0.
     """
 

@@ -32,12 +32,7 @@ class News:
 
 
 class Subscription:
-    """A queue of the newest `most` news, made by `Publisher.subscribe`.
-
-    Attributes:
-        kinds: Kinds of its news.
-        dropped: Number of news that newer ones have pushed out of the queue.
-    """
+    """A queue of the newest `most` news, made by `Publisher.subscribe`; it counts the ones dropped."""
 
     def __init__(self, kinds: frozenset[str], most: int, wake: Callable[[], None] | None) -> None:
         self.kinds = kinds
@@ -54,10 +49,9 @@ class Subscription:
         return self._over and not self._queue
 
     def take(self, timeout_s: float | None = None) -> list[News]:
-        """Remove and return all news, oldest first; wait for some.
+        """Remove and return all news, oldest first.
 
-        Args:
-            timeout_s: Longest wait, s; 0 for none, None until something comes or the subscription ends.
+        Waits `timeout_s` for some, 0 not at all, None until something comes or the subscription ends.
         """
         with self._filled:
             if not self._queue and not self._over and timeout_s != 0:

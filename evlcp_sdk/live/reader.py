@@ -20,13 +20,7 @@ _LEAP_S: Final = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Slice:
-    """A piece of the stream as it came.
-
-    Attributes:
-        events: Its events.
-        triggers: Its triggers.
-        arrived_s: Time of its arrival, s.
-    """
+    """A piece of the stream, and the time of its arrival, s."""
 
     events: Events
     triggers: Triggers
@@ -62,12 +56,9 @@ class ArrivalClock:
 
 
 class Reader:
-    """The slices of a source, read ahead by a thread.
+    """The slices of a source, read ahead by a thread; the source is not closed.
 
     Beyond `_MAX_EVENTS`, the oldest of a live source are dropped; any other source waits.
-
-    Args:
-        source: The source; not closed.
 
     Attributes:
         arrivals: The arrivals of its slices.

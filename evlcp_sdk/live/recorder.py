@@ -21,13 +21,9 @@ of the run."""
 
 
 class Recorder:
-    """Writes events and triggers to a RAW file in a thread of its own, from `start` to `stop`.
+    """Writes a sensor's events and triggers to a RAW file in a thread of its own, from `start` to `stop`.
 
-    Args:
-        publisher: Gives the events and triggers.
-        folder: Folder of the files, which are named by their start; created if need be.
-        width: Columns of the sensor.
-        height: Its rows.
+    Files in the folder, created if need be, are named by the time of their start.
     """
 
     def __init__(self, publisher: Publisher, folder: Path, width: int, height: int) -> None:

@@ -27,12 +27,7 @@ _MAX_BARS: Final = 64
 
 
 class Serializer:
-    """Serializes results for browsers.
-
-    Args:
-        links: The configurations by name, as `name_links` gives them.
-        sites: Places of the bars, for the map.
-    """
+    """Serializes results for browsers, by the links' names and, for the map, the places of the bars."""
 
     def __init__(self, links: Mapping[str, Link], sites: Sequence[BarSite] = ()) -> None:
         self._columns = frame_columns(filtered=False, links=len(links) > 1)
@@ -44,9 +39,7 @@ class Serializer:
     def serialize(self, news: News, *, frames: bool) -> list[tuple[str, str]]:
         """Lines of JSON for some news, each with its kind: that of the news, or `bars`.
 
-        Args:
-            news: The news, of a kind that browsers show.
-            frames: Serialize frames, too; False without browsers.
+        Frames are only kept for pictures unless `frames`.
         """
         if news.kind != "frame":
             return [(kind, json.dumps({"line": kind} | values)) for kind, values in self._describe_news(news)]
@@ -134,7 +127,6 @@ def _picture_json(picture: Picture, bars: Sequence[Frame]) -> str:
 
 
 def _describe_bar(frame: Frame) -> dict[str, Any]:
-    """The places and symbols of a bar's clusters."""
     points = np.round(frame.points_px, 2).tolist()
     return {
         "transmitter": frame.transmitter,

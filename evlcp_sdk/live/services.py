@@ -46,17 +46,10 @@ def serve(
     sites: Sequence[BarSite] = (),
     clock_zero: ClockZero = None,
 ) -> Iterator[dict[str, Server]]:
-    """Serve in a thread beside a live run; at the end, send the rest and complete a recording.
+    """Serve in a thread beside a live run; at the end, close the publisher and complete a recording.
 
-    Gives the servers in use: `view`, `nmea` and `gpsd`.
-
-    Args:
-        options: The services.
-        publisher: Gives the results; closed at the end.
-        links: The configurations by name, as `name_links` gives them.
-        name: Name of the source.
-        sites: Places of the bars.
-        clock_zero: UTC of the camera clock's 0; None if it is not known.
+    Gives the servers in use: `view`, `nmea` and `gpsd`. `links` are the configurations by name, as
+    `name_links` gives them; `name` is that of the source.
 
     Raises:
         ConfigError: A port cannot be used, or a package is not installed.

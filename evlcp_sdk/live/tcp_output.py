@@ -25,16 +25,11 @@ _KERNEL_BYTES: Final = 1 << 16
 
 
 class TcpOutput(Server):
-    """Serves positions over TCP.
+    """Serves positions over TCP, on this machine only.
 
-    Where the UTC of the camera's clock is not known, it is taken once from the computer's clock, as programs
-    that read positions need a time.
-
-    Args:
-        publisher: Gives the fixes.
-        gpsd: As gpsd's JSON, to clients that request `?WATCH`; or else NMEA, to every client.
-        port: Port of this machine; 0 for any free one.
-        clock_zero: UTC of the camera clock's 0; None if it is not known.
+    As gpsd's JSON, to clients that request `?WATCH`, or else as NMEA, to every client. Where the UTC of the
+    camera's clock is not known, it is taken once from the computer's clock, as programs that read positions
+    need a time.
     """
 
     def __init__(
@@ -99,7 +94,6 @@ class TcpOutput(Server):
             writer.write(data)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve one client until it leaves."""
         if len(self._clients) >= _MAX_CLIENTS:
             writer.close()
             return

@@ -63,7 +63,6 @@ class _Browser:
     """A connected browser.
 
     Attributes:
-        socket: Its connection.
         waiting: The newest results that it has not got, as JSON.
         dropped: Number of results that newer ones have pushed out.
         ready: It has shown the last bundle.
@@ -85,16 +84,10 @@ class _Browser:
 
 
 class Viewer(Server):
-    """Serves the page and its data.
+    """Serves the page and its data; other machines reach it only at another `host` than the default.
 
-    Args:
-        publisher: Gives results and pictures.
-        links: The configurations by name, as `name_links` gives them.
-        name: Name of the source, for the title.
-        sites: Places of the bars, for the map.
-        host: Address to listen at; other machines reach it only at another one than the default.
-        port: Port to listen at; 0 for any free one.
-        recorder: Starts and stops recordings on a browser's request; None to forbid it.
+    A browser may start and stop recordings if there is a `recorder`; `sites` are for the map, and `links` are
+    the configurations by name, as `name_links` gives them.
     """
 
     def __init__(
@@ -204,7 +197,6 @@ class Viewer(Server):
             return False
 
     async def _serve(self, socket: "ServerConnection") -> None:
-        """Serve one browser until it leaves."""
         from websockets.exceptions import ConnectionClosed
 
         browser = _Browser(socket)
@@ -240,7 +232,6 @@ class Viewer(Server):
         return True
 
     def _describe_run(self) -> dict[str, Any]:
-        """The first message to a browser."""
         return {
             "about": {
                 "name": self._name,
@@ -269,7 +260,6 @@ class Viewer(Server):
             self._unsent += browser.enqueue(line)
 
     def _send_bundles(self) -> None:
-        """Send a bundle to each browser that is ready for one."""
         ready = [browser for browser in self._browsers if browser.ready]
         if not ready:
             return

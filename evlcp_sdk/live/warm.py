@@ -25,13 +25,10 @@ _PLACE: Final = (-2.0, 50.0, 0.5)
 
 
 def load_kernels(links: Sequence[Link], *, positions: bool = False) -> None:
-    """Load the kernels of a receiver by receiving a piece of the recording that comes with the SDK.
+    """Load a receiver's kernels by receiving a piece of the recording that comes with the SDK.
 
-    Then again with vibration and half of the light, which needs the second reading of uncertain frames.
-
-    Args:
-        links: The receiver's links.
-        positions: Load the kernels of positions, too, by a fix.
+    Then again with vibration and half of the light, which needs the second reading of uncertain frames; and
+    compute a fix for those of `positions`.
     """
     if positions:
         for link in links:
@@ -54,7 +51,6 @@ def load_kernels(links: Sequence[Link], *, positions: bool = False) -> None:
 
 
 def _solve_bar_pose(link: Link) -> None:
-    """Solve for the pose of a camera that sees a bar."""
     attitude = Attitude(heading_deg=0.0)
     along = np.linspace(0.5, -0.5, link.bar.clusters)[:, None] * (0.0, 0.0, link.bar.length_m)
     points, _ = project_bars(along + _PLACE, np.zeros(3), attitude.rotation(), link.camera)

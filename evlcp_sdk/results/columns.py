@@ -42,12 +42,7 @@ PLACE_COLUMNS = (
 
 
 def frame_columns(*, filtered: bool, links: bool) -> tuple[str, ...]:
-    """The columns of a run.
-
-    Args:
-        filtered: A tracking algorithm filters the distance.
-        links: There are several links.
-    """
+    """The columns of a run, by whether distances are filtered, and whether there are several links."""
     return FRAME_COLUMNS + FILTERED_COLUMNS * filtered + (LINK_COLUMN,) * links
 
 

@@ -18,14 +18,10 @@ VERSION: Final = {"class": "VERSION", "release": "3.22", "rev": "evlcp", "proto_
 
 
 def tpv(fix: Fix, filtered: Place | None, zero: datetime | None) -> dict[str, Any]:
-    """A fix as a TPV report: mode 3, or 1 for a refused one, which has no place.
+    """A fix as a TPV report: mode 3, or 1 for a refused one, which has no filtered place.
 
-    Sigmas are standard deviations, and place, speed and course the filter's, as in `fixes.nmea`.
-
-    Args:
-        fix: The fix, given or refused.
-        filtered: The filtered place at its time; None for a refused one.
-        zero: UTC of the camera clock's 0; None for a report without a time.
+    Sigmas are standard deviations, and place, speed and course the filter's, as in `fixes.nmea`. It has a
+    time if UTC of the camera clock's 0 is known.
     """
     report: dict[str, Any] = {"class": "TPV", "device": DEVICE, "mode": 1 if filtered is None else 3}
     if zero is not None:
@@ -64,12 +60,9 @@ def sky(fix: Fix, zero: datetime | None) -> dict[str, Any]:
 def answer_request(
     request: str, watch: dict[str, Any], newest: dict[str, dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """The answer of gpsd to a line of a client.
+    """The answer of gpsd to a line of a client, with or without its semicolon.
 
-    Args:
-        request: The line, with or without its semicolon.
-        watch: What the client subscribes to; a `?WATCH` changes it.
-        newest: The newest reports, by class, for `?POLL`.
+    `?WATCH` changes `watch`, the client's subscription; `?POLL` gives the newest reports, by class.
     """
     verb, _, text = request.strip().rstrip(";").partition("=")
     device = {"class": "DEVICE", "path": DEVICE, "driver": "evlcp", "activated": True, "flags": 1}

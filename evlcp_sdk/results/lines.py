@@ -11,13 +11,9 @@ from evlcp_sdk.values import Fix, Frame, Packet
 
 
 class JsonLines:
-    """Writes a line for each frame, message and fix as it comes; its key `line` is the kind.
+    """Writes a line for each frame, message and fix as it comes, without its end; its key `line` is the kind.
 
-    Args:
-        write: Takes a line, without its end.
-        filtered: Distances are filtered, too.
-        links: There are several links.
-        links_of: Gives the names of the links that a fix is computed from, where there are several.
+    Where there are several links, `links_of` gives the names of those that a fix is computed from.
     """
 
     def __init__(
@@ -50,12 +46,7 @@ class JsonLines:
 
 
 def format_frame(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> str:
-    """The line of a frame as JSON, rounded as in `frames.csv`.
-
-    Args:
-        frame: The frame.
-        columns: `FRAME_COLUMNS`, and others after them.
-    """
+    """The line of a frame as JSON, rounded as in `frames.csv`; other columns follow `FRAME_COLUMNS`."""
     soft, distance = frame.soft, frame.range
     # Written out for hundreds of frames a second: rounding and `json` take twice as long.
     numbers = (

@@ -44,10 +44,8 @@ class Nmea(Sink):
 def format_sentences(fix: Fix, filtered: Place | None, zero: datetime | None) -> str:
     """The NMEA sentences of a fix: a TXT for each alarm, GGA, RMC and, where there is a place, GST and GBS.
 
-    Args:
-        fix: The fix, given or refused.
-        filtered: The filtered place at its time; None for a refused one.
-        zero: UTC of the camera clock's 0; None to write the clock itself as time of day.
+    A refused fix has no filtered place. Without UTC of the camera clock's 0 the clock itself is the time of
+    day.
     """
     clock = format_clock(fix.t_us, zero)
     alarms = [txt(len(fix.alarms), n, _alarm_text(fix, alarm)) for n, alarm in enumerate(fix.alarms, 1)]
@@ -75,12 +73,10 @@ def _alarm_text(fix: Fix, alarm: str) -> str:
 
 
 def gga(clock: Clock, place: tuple[float, float, float] | None, bars: int) -> str:
-    """A GGA sentence, with its line end.
+    """A GGA sentence, with its line end, by the number of bars that the fix is computed from.
 
-    Args:
-        clock: Its time.
-        place: Latitude and longitude, degrees, and height above the ellipsoid, m; None where there is no fix.
-        bars: Number of bars that it is computed from.
+    The place is latitude and longitude, degrees, and height above the ellipsoid, m; None where there is no
+    fix.
     """
     if place is None:
         return _close_sentence(f"INGGA,{clock[0]},,,,,0,{bars:02d},,,M,,M,,")
@@ -91,12 +87,9 @@ def gga(clock: Clock, place: tuple[float, float, float] | None, bars: int) -> st
 
 
 def rmc(clock: Clock, place: tuple[float, float, float] | None, velocity: tuple[float, float] | None) -> str:
-    """An RMC sentence, with its line end.
+    """An RMC sentence, with its line end; the place is that of `gga`.
 
-    Args:
-        clock: Its time.
-        place: As of `gga`.
-        velocity: Speed over ground, m/s, and course, degrees clockwise from north; None where not known.
+    The velocity is the speed over ground, m/s, and the course, degrees clockwise from north; None if unknown.
     """
     time, date = clock
     if place is None:
@@ -112,10 +105,8 @@ def rmc(clock: Clock, place: tuple[float, float, float] | None, velocity: tuple[
 def gst(clock: Clock, misfit: float, covariance_m2: NDArray[np.float64]) -> str:
     """A GST sentence, with its line end: the error's ellipse and sigmas.
 
-    Args:
-        clock: Its time.
-        misfit: Root mean square of the residuals, in sigmas; NaN where there are none.
-        covariance_m2: Covariance of east, north and up, m2, float64 (3, 3).
+    The misfit is the root mean square of the residuals, in sigmas, NaN where there are none; the covariance
+    that of east, north and up, m2, float64 (3, 3).
     """
     values, axes = np.linalg.eigh(covariance_m2[:2, :2])
     minor, major = np.sqrt(np.maximum(values, 0)).tolist()
@@ -128,13 +119,9 @@ def gst(clock: Clock, misfit: float, covariance_m2: NDArray[np.float64]) -> str:
 
 
 def gbs(clock: Clock, undetected_m: NDArray[np.float64], failed: FailedBar | None = None) -> str:
-    """A GBS sentence, with its line end: the effect of an undetected fault, and the bar that failed.
+    """A GBS sentence, with its line end: the shift of the fix by an undetected fault, and the failed bar.
 
-    Args:
-        clock: Its time.
-        undetected_m: Largest shift of the fix by an undetected fault: east, north, up, m, float64 (3,); what
-            is not finite is left empty.
-        failed: The bar that was left out.
+    The shift is the largest possible, east, north, up, m, float64 (3,); what is not finite is left empty.
 
     >>> gbs(format_clock(1e6, None), np.array([0.5, 0.25, 0.125])).strip()
     '$INGBS,000001.000,0.250,0.500,0.125,,,,*64'

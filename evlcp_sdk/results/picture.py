@@ -12,11 +12,7 @@ _PALETTE: Final = bytes([16, 16, 20, 70, 150, 255, 255, 205, 70, 235, 235, 235])
 
 
 class EventImage:
-    """Which polarities the pixels of a sensor showed, as a PNG picture of two bits a pixel.
-
-    Args:
-        width: Width of the sensor, px.
-        height: Its height, px.
+    """Which polarities the pixels of a sensor of this size showed, as a PNG picture of two bits a pixel.
 
     Attributes:
         cells: Polarities of each pixel, uint8 (height, width): 0 none, 1 OFF, 2 ON, 3 both.

@@ -65,8 +65,10 @@ def build_summary(
     """
     tally, diagnostics = facts.tally, run_checks(facts)
     if facts.parts:
-        parts = {name: _describe_link(one.link) | _link_results(one) for name, one in facts.parts.items()}
-        description: dict[str, Any] = {"links": parts}
+        description: dict[str, Any] = {"links": {}}
+        for name, part in facts.parts.items():
+            results = {"counts": dict(part.counts), "messages_off": messages_off_reason(part.link)}
+            description["links"][name] = _describe_link(part.link) | results
     else:
         description = _describe_link(facts.link)
     return {
@@ -101,18 +103,12 @@ def _character_text(figures: Mapping[str, Any], facts: Facts) -> dict[str, Any]:
 
 
 def _describe_link(link: Link) -> dict[str, Any]:
-    """A link, so that a result can be reproduced."""
     return {
         "digest": link.digest,
         "codebook": {"digest": link.codebook.digest, "profile": link.codebook.profile},
         "revisions": dict(link.revisions),
         "configuration": {section: dict(keys) for section, keys in link.table.items()},
     }
-
-
-def _link_results(part: Facts) -> dict[str, Any]:
-    """The counts of one of several links, and whether its messages were read."""
-    return {"counts": dict(part.counts), "messages_off": messages_off_reason(part.link)}
 
 
 def write_summary(table: Mapping[str, Any], folder: ResultFolder) -> None:

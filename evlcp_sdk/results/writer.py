@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from evlcp_sdk.diagnosis.facts import Facts, find_other_codewords
@@ -159,7 +158,6 @@ class ResultWriter:
         return table
 
     def _collect_facts(self, end: RunEnd, positions: Mapping[str, Any]) -> Facts:
-        """What the checks go by at the end."""
         recording = end.recording
         first_us, last_us = recording.get("first_us"), recording.get("last_us")
         read = recording.get("counts", {})
@@ -207,8 +205,6 @@ class ResultWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_fault: object) -> None:
         """Drop what `finish` has not moved into place."""
-        self._stack.__exit__(kind, value, trace)
+        self._stack.close()
