@@ -64,11 +64,10 @@ class Steps:
     """The algorithms that decode a frame, checked and announced; it keeps no state of a stream."""
 
     def __init__(self, link: Link, announcer: Announcer, tracker: Tracker) -> None:
-        self._codebook = link.codebook
+        self._codebook = book = link.codebook
         self._corrector = RangeCorrector()
         self._announcer = announcer
         self._guards = {role: Guard(link, role) for role in ("separation", "decoding", "ranging")}
-        book = link.codebook
         self._separate = compile_algorithm(link, "separation", book)
         self._decode: Callable[..., SoftSymbols] = compile_algorithm(link, "decoding", book)
         self._measure = compile_algorithm(link, "ranging", link.camera, link.bar, book)
@@ -287,15 +286,12 @@ class FrameReader:
             whole = self._aligner.drop_cut_clusters(aligned)
             distance = self._steps.measure(FrameView(sums, aligned.offset_px, whole, soft))
         pilot_sums = sums[: self._pilot_chips]
-        points_px, sigma_px, flank_px, centre_px = self._find_points(
-            presence, placement, pilot_sums, aligned.corner_px
-        )
+        image = self._find_points(presence, placement, pilot_sums, aligned.corner_px)
         # It is needed for two images at one time only; so the pilot alone is kept, not the whole frame.
         spread = LazySpread(
             pilot_sums.copy(), self._pilots, self._every, self._layout, self._pairs, placement
         )
-        image = points_px, sigma_px, flank_px, centre_px
-        line = self._line_of_sight(points_px, sigma_px, attitude)
+        line = self._line_of_sight(*image[:2], attitude)
         return FrameReading(soft.symbols, calibrated, distance, *image, line, spread, flooded)
 
     def _line_of_sight(

@@ -213,7 +213,7 @@ def list_nodes(information: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 @lru_cache(maxsize=16)
-def _cached_nodes(information: bytes) -> NDArray[np.int64]:
+def _nodes_of(information: bytes) -> NDArray[np.int64]:
     """As `list_nodes`, which takes a millisecond, while a link is compiled again and again."""
     return list_nodes(np.frombuffer(information, np.bool_))
 
@@ -235,7 +235,7 @@ class _PolarCode:
     @cached_property
     def nodes(self) -> NDArray[np.int64]:
         """The order of decoding; found with the first block."""
-        return _cached_nodes(self.information.tobytes())
+        return _nodes_of(self.information.tobytes())
 
     def encode(self, bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if bits.shape != (self.message_bits,):
