@@ -359,6 +359,10 @@ class Range:
         return f"Range({_format_distance(self)}, {self.pairs} pairs)"
 
 
+NO_RANGE = Range(math.nan, math.nan, 0)
+"""No distance was measured."""
+
+
 @dataclass(frozen=True, eq=False)
 class Frame:
     """One decoded frame: a row of `frames.csv`.

@@ -14,11 +14,9 @@ from evlcp_sdk.rx.framer import Framer, StreamContext, record_light
 from evlcp_sdk.rx.guard import Guard, compile_algorithm
 from evlcp_sdk.rx.reflections import FrameDetection, PacketAssembler, ReflectionQueue
 from evlcp_sdk.rx.regions import TrackedRegion
-from evlcp_sdk.values import DecodedFrame, Frame, Range
+from evlcp_sdk.values import NO_RANGE, DecodedFrame, Frame
 
 _COUNTS = "events_in_regions", "events_in_regions_on", "regions_opened", "regions_released", "frames"
-
-_NO_RANGE = Range(math.nan, math.nan, 0)
 
 _LOOKBACK_FRAMES = 96
 """Frames for which the places of a region are kept: a framing may give a frame so late."""
@@ -146,7 +144,7 @@ class PluginFramer(Framer):
                 frame=decoded.frame,
                 t_us=self._camera_us(decoded.t_us),
                 soft=decoded.soft,
-                range=_NO_RANGE,
+                range=NO_RANGE,
                 filtered=None,
                 x_px=float(x[0]),
                 y_px=float(y[0]),

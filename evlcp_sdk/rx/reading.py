@@ -22,7 +22,7 @@ from evlcp_sdk.rx.regions import MARGIN_PX, BarPlace, TrackedRegion
 from evlcp_sdk.rx.spread import LazySpread, Spread, neighbour_pairs
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.tilt import LineOfSight, line_of_sight, magnification_of
-from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
+from evlcp_sdk.values import NO_RANGE, FrameView, PresenceMap, Range, SoftSymbols
 
 _FRAME_WORTH = 6.0
 """LLRs of a cluster that those of all its frame are worth: light and vibration are much the same for all,
@@ -55,7 +55,7 @@ _SURE_QUALITY = 0.98
 """Quality of a frame from which on its symbols hold, however the light changes: where they are wrong, it is
 less. A halo and a jolt look like a step of light now and then."""
 
-_NO_RANGE, _NO_LINE_OF_SIGHT = Range(math.nan, math.nan, 0), LineOfSight()
+_NO_LINE_OF_SIGHT = LineOfSight()
 
 _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
 
@@ -280,8 +280,8 @@ class FrameReader:
         if not due.has_pilot:
             # Another distance or other points by the same pilot would be nothing new.
             unseen = *_NO_POINTS, aligned.centre_px, _NO_LINE_OF_SIGHT, None
-            return FrameReading(soft.symbols, calibrated, _NO_RANGE, *unseen, flooded)
-        distance = _NO_RANGE
+            return FrameReading(soft.symbols, calibrated, NO_RANGE, *unseen, flooded)
+        distance = NO_RANGE
         if ranged:
             whole = self._aligner.drop_cut_clusters(aligned)
             distance = self._steps.measure(FrameView(sums, aligned.offset_px, whole, soft))

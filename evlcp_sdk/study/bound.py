@@ -19,11 +19,9 @@ from scipy.stats import theilslopes
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.values import FrameView, PresenceMap, Range
+from evlcp_sdk.values import NO_RANGE, FrameView, PresenceMap, Range
 
 Array = NDArray[np.float64]
-
-_NO_RANGE = Range(math.nan, math.nan, 0)
 
 _LEAST_INFORMATION = 1e-9
 """Share of a parameter's own information below which the other parameters leave none."""
@@ -162,7 +160,7 @@ def frame_bound(link: Link, *, full_events: float = 3.0) -> Callable[[FrameView]
 def _compute_frame_bound(link: Link, full_events: float, view: FrameView) -> Range:
     seen, middles = _find_middles(view.presence)
     if int((seen[1:] & seen[:-1]).sum()) < _LEAST_BOUNDARIES:
-        return _NO_RANGE
+        return NO_RANGE
     width, height = np.ptp(middles[seen], axis=0)
     is_upright = bool(height >= width)
     positions = middles[:, 1 if is_upright else 0]
@@ -185,7 +183,7 @@ def _compute_frame_bound(link: Link, full_events: float, view: FrameView) -> Ran
     start = np.array([spacing, centre, 0.0, 0.5, np.log(_BLUR_PX), 0.0, 0.0, 0.0])
     solution = _fit_frame(start, codes, values, seen, rows, row_offset, _value_times(len(values)))
     if solution is None:
-        return _NO_RANGE
+        return NO_RANGE
     fit, noise = solution
     distance_m = link.camera.distance_m(link.bar.column_pitch_m, float(fit[0]) * float(np.hypot(1.0, tilt)))
     sigma_m = bar_bound(
@@ -199,7 +197,7 @@ def _compute_frame_bound(link: Link, full_events: float, view: FrameView) -> Ran
         shift_px=float(fit[1]),
     )
     pairs = int((seen[1:] & seen[:-1]).sum())
-    return Range(distance_m, sigma_m, pairs) if math.isfinite(sigma_m) else _NO_RANGE
+    return Range(distance_m, sigma_m, pairs) if math.isfinite(sigma_m) else NO_RANGE
 
 
 def _average_rows(

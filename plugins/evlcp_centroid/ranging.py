@@ -11,9 +11,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import FrameView, Range
-
-_NO_RANGE = Range(float("nan"), float("nan"), 0)
+from evlcp_sdk.values import NO_RANGE, FrameView, Range
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ class CentroidRanging(Ranging):
             seen = np.flatnonzero((weight > 0) & same)
             seen = seen[skip : len(seen) - skip]
             if len(seen) < least:
-                return _NO_RANGE
+                return NO_RANGE
             down = maps.sum(2)[seen] @ np.arange(maps.shape[1]) / weight[seen]
             right = maps.sum(1)[seen] @ np.arange(maps.shape[2]) / weight[seen]
             image, place = right + 1j * down, layout[seen]
@@ -86,7 +84,7 @@ class CentroidRanging(Ranging):
                 off = np.abs(image - shift - scale * place)
                 keep = off <= 3 * np.median(off) + 1e-9
                 if keep.sum() < least:
-                    return _NO_RANGE
+                    return NO_RANGE
                 spread = place[keep] - place[keep].mean()
                 power = float((np.abs(spread) ** 2).sum())
                 scale = complex(np.conj(spread) @ image[keep]) / power
@@ -96,7 +94,7 @@ class CentroidRanging(Ranging):
             variance = float((off**2).sum()) / max(2 * kept - 4, 1)
             size = abs(scale)
             if not size > 0:
-                return _NO_RANGE
+                return NO_RANGE
             distance = camera.focal_px / size
             return Range(distance, distance * float(np.sqrt(variance / power)) / size, kept)
 
@@ -111,4 +109,4 @@ class NoRanging(Ranging):
 
     def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
         """Nothing to precompute."""
-        return lambda _: _NO_RANGE
+        return lambda _: NO_RANGE

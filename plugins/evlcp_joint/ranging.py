@@ -16,9 +16,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import Curvature, FrameView, Range, replace_fields, to_kernel_array
-
-_NO_RANGE = Range(float("nan"), float("nan"), 0)
+from evlcp_sdk.values import NO_RANGE, Curvature, FrameView, Range, replace_fields, to_kernel_array
 
 _START_GAIN = 0.8
 """Share of a full value that a cluster's rows show, with a fifth of the negative events missing."""
@@ -111,7 +109,7 @@ class JointScaleRanging(Ranging):
         def measure(view: FrameView) -> Range:
             found = find_bar(view, chips)
             if found is None:
-                return _NO_RANGE
+                return NO_RANGE
             sums, offset_px, line, seen = found
             height, (first, spacing, _, tilt, _) = sums.shape[1], line.tolist()
             values = np.empty((n, height))
@@ -131,7 +129,7 @@ class JointScaleRanging(Ranging):
             # From the start, by cells, an end moves by the size of a cell and a pixel of blur at most.
             farthest = abs(spacing_px - spacing) * (clusters - 1) / 2 + abs(centre_px - centre)
             if math.isnan(variance) or farthest > view.presence.grid_px + 1:
-                return _NO_RANGE
+                return NO_RANGE
             # Rows measure the bar along one axis; a tilted bar is longer by its slope.
             stretch = math.hypot(1.0, tilt)
             distance = camera.distance_m(spacing_m, spacing_px * stretch)
@@ -208,7 +206,7 @@ def _average_columns(parts: Sequence[Range]) -> Range:
     few, is too uncertain for a weight; all of them together give the sigma of a boundary.
     """
     if not parts:
-        return _NO_RANGE
+        return NO_RANGE
     distance, sigma, pairs = np.array([(part.distance_m, part.sigma_m, part.pairs) for part in parts]).T
     share = pairs**3
     weight = share / np.mean(sigma**2 * share)

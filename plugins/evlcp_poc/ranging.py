@@ -16,9 +16,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import FrameView, Range, to_kernel_array
-
-_NO_RANGE = Range(float("nan"), float("nan"), 0)
+from evlcp_sdk.values import NO_RANGE, FrameView, Range, to_kernel_array
 
 _RIM_PX = 0.2
 """Error that the shift of two clusters of a panel has in all frames alike: the halo around it has fewer rows
@@ -139,7 +137,7 @@ class PocRanging(Ranging):
             px_per_m, *lit_px = _kernels.find_middles(maps, apart, self.min_pixels, middles)
             far = select_pairs((middles[:, 0] >= 0).tobytes())
             if len(far[0]) < least or px_per_m <= 0:
-                return _NO_RANGE
+                return NO_RANGE
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
             neighbour_px = px_per_m * neighbour
             height = cut_size(2 * neighbour_px + 8)
