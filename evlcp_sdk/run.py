@@ -776,7 +776,7 @@ def survey(
     sites = [replace(bar.site, link=link_of_id[bar.site.transmitter_id] or None) for bar in surveyed]
     contradictions = {id: text for bars in registries for id, text in bars.find_contradictions(sites).items()}
     return [
-        replace(bar, site=site, contradicted=contradictions.get(site.transmitter_id, ""))
+        replace(bar, site=site, contradiction=contradictions.get(site.transmitter_id, ""))
         for bar, site in zip(surveyed, sites, strict=True)
     ]
 

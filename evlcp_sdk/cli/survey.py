@@ -85,7 +85,7 @@ def _write(found: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None:
         bars = [
             asdict(bar.site)
             | {"covariance_m2": bar.covariance_m2.tolist(), "views": bar.views}
-            | ({"contradicted": bar.contradicted} if bar.contradicted else {})
+            | ({"contradicted": bar.contradiction} if bar.contradiction else {})
             for bar in found
         ]
         print_json({"bars": bars})
@@ -100,5 +100,5 @@ def _format_bar(bar: SurveyedBar) -> str:
     return (
         f"transmitter {site.transmitter_id}{kind}: {site.latitude_deg:.9f}, {site.longitude_deg:.9f} deg,"
         f" {site.height_m:.3f} m, to {site.position_sigma_m:.3f} m, from {format_count(bar.views, 'view')}"
-        + (f"; its beacon contradicts that: {bar.contradicted}" if bar.contradicted else "")
+        + (f"; its beacon contradicts that: {bar.contradiction}" if bar.contradiction else "")
     )

@@ -424,4 +424,4 @@ def _describe_fix(fix: Fix) -> dict[str, Any]:
 def _describe_bias(bias: EstimatedBias) -> dict[str, Any]:
     names = ("correction", "sigma", "stated_sigma")
     numbers = {name: float(f"{getattr(bias, name):.6g}") for name in names}
-    return {"part": bias.part, "what": bias.what, **numbers, "determined": bias.determined}
+    return {"part": bias.part, "what": bias.what, **numbers, "determined": bias.is_determined}

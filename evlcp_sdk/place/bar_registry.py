@@ -75,13 +75,13 @@ class BarRegistry:
 
     @property
     def unseen_sites(self) -> tuple[BarSite, ...]:
-        """The sites of which no transmitter was received."""
+        """The sites without a received transmitter."""
         seen = {id(self._match_site(number)) for number in self._states}
         return tuple(site for site in self._sites if id(site) not in seen)
 
     @property
     def contradictions(self) -> dict[int, str]:
-        """How beacons contradict their sites, by transmitter; such transmitters are left out."""
+        """How beacons contradict their sites, by transmitter; these transmitters are not used."""
         found = {number: self.contradiction_of(number) for number in sorted(self._states)}
         return {number: how for number, how in found.items() if how}
 

@@ -281,7 +281,7 @@ class WhitenedView:
 
     @classmethod
     def of(cls, view: CalibrationView, camera: CameraModel, spec: ErrorModel) -> "WhitenedView | None":
-        """The points of the bars of which enough is seen; None if there is none."""
+        """The points of the bars with enough of them; None if there is none."""
         columns, whiten, survey = [], [], {}
         vibration = common_vibration(view.bars)
         for bar in view.bars:

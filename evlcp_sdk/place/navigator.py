@@ -52,7 +52,7 @@ class EstimatedBias:
     stated_sigma: float
 
     @property
-    def determined(self) -> bool:
+    def is_determined(self) -> bool:
         """Whether the drive determines it; else it keeps the stated sigma."""
         return self.sigma < _DETERMINED_SHARE * self.stated_sigma
 

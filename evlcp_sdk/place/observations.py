@@ -185,8 +185,8 @@ class KnownAngles(NamedTuple):
         if not any((vibration_rad, *sigmas)):
             free = (False, False, not has_heading or attitude.heading_sigma_deg > 0)
         causes, known = attitude.bias_root_rad(), 3 if has_heading else 2
-        # Noise is the attitude's own, and vibration, which shifts an image down or sideways: a rotation about
-        # the camera's horizontal and its upright axis, of which the second is not the world's.
+        # Noise is the attitude's own, and vibration, which shifts an image down or sideways: it rotates the
+        # camera about its horizontal and its upright axis, which is tilted by the pitch.
         pitch = math.radians(attitude.pitch_deg)
         by_vibration = [[1.0, 0.0], [0.0, math.tan(pitch)], [0.0, 1 / math.cos(pitch)]]
         moves = np.concatenate([causes, vibration_rad * np.array(by_vibration)], 1)
@@ -395,7 +395,7 @@ def compute_shared_errors(
 
 
 def _find_farthest_pair(places: Floats, rows: NDArray[np.int64]) -> tuple[int, int]:
-    """Find the two of some places that are farthest apart: the farthest from the farthest from one."""
+    """Find two places far apart: the farthest from the farthest from one."""
     one = other = int(rows[0])
     for _ in range(2):
         distance = np.linalg.norm(places[rows] - places[other], axis=1)

@@ -33,7 +33,7 @@ _NEIGHBOUR_FACTOR = 1.8
 correlated. From simulated drives, by night and by day, with a lens's wings and without, turning."""
 
 _PIXEL_FREEDOM = 3
-"""Squares that the stated error within pixels is worth, beside the 13 that 16 points about a line show."""
+"""Degrees of freedom of the stated error within pixels; 16 points about a line have 13."""
 
 _LEAST_ACROSS = 0.1
 """Least ratio of errors across a bar to those along it."""
@@ -262,7 +262,7 @@ def locate_bar(
     standing = np.zeros((3, 8))
     if sigma.is_known:
         standing[:2, :7] = -by_image @ camera.parameter_jacobian(direction)
-        # A longer lens puts a bar of so many pixels farther away.
+        # With a longer lens, the same image is of a bar farther away.
         standing[:, 0] += ray * depth / camera.focal_px
         standing[:, :7] = standing[:, :7] @ sigma.covariance_root(camera)
     standing[:, 7] = ray * math.hypot(depth * spec.stretch_share, frame.range.standing_m)

@@ -238,7 +238,7 @@ def _fit_and_assess(problem: Problem) -> Pose | Rejection:
 
 
 def _fit_if_consistent(problem: Problem) -> Pose | Rejection | None:
-    """The pose by all that is given; None if that is contradictory; a rejection if it may be consistent."""
+    """The pose by all observations; None if they are contradictory; a rejection if they may be consistent."""
     fits = fit_from_all_starts(problem)
     if isinstance(fits, Rejection):
         return fits

@@ -128,19 +128,20 @@ _MOST_PASSES, _SETTLED_RAD = 8, 1e-4
 
 @dataclass(frozen=True, eq=False)
 class SurveyedBar:
-    """A bar as surveyed, from so many views.
+    """A bar as surveyed.
 
     Attributes:
         site: With its sigmas.
         covariance_m2: Of its place, to the east, north and up, float64 (3, 3).
-        contradicted: How its own beacon contradicts that, beyond both sigmas; empty where it does not, or
-            where beacons are not used (`position.beacons`).
+        views: Number of views of it.
+        contradiction: How its own beacon contradicts the site; empty where it does not, or where beacons are
+            not used (`position.beacons`).
     """
 
     site: BarSite
     covariance_m2: Floats
     views: int
-    contradicted: str = ""
+    contradiction: str = ""
 
 
 def survey_bars(

@@ -245,7 +245,7 @@ class TrajectoryPoint:
         motion: The camera's motion since the point before.
         rejected: Fixes in a row that were rejected, up to this one; 0 where it counts.
         starts: A trajectory starts here.
-        accepted: Fixes that count since then, up to this one, as far as that matters.
+        accepted: Fixes that count since then, at most `_MOST_REJECTED`.
         fix: The fix, accepted or rejected.
         course: The course of fixes of the same bars, with little of their noise.
         recent: The points from the one before that course on, as long as it is short.
@@ -476,7 +476,7 @@ def _observe_on_course(predicted: TrajectoryPoint, fix: Fix) -> tuple[Trajectory
     speed_m_s = np.array([horizontal.real, horizontal.imag, course.speed_m_s[2]])
     place_m = course.place_m + speed_m_s * dt_s
     offset_m, count, fade = fix.enu_m - place_m, course.count, math.exp(-dt_s / _COURSE_S)
-    # Of the line through all of so many fixes, until older ones count less: Brookner, Tracking, 1998, 1.2.10.
+    # Gains of a line through all fixes, until older ones count less: Brookner, Tracking, 1998, 1.2.10.
     by_place = max(2 * (2 * count + 1) / ((count + 1) * (count + 2)), 1 - fade**2)
     by_speed = max(6 / ((count + 1) * (count + 2)), (1 - fade) ** 2)
     place_m, speed_m_s = place_m + by_place * offset_m, speed_m_s + by_speed * offset_m / max(dt_s, 1e-6)
@@ -518,7 +518,7 @@ def _add_fix_causes(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
 def _add_imu_biases(
     point: TrajectoryPoint, t_us: float, motion: ImuMotion, spec: ErrorModel
 ) -> TrajectoryPoint:
-    """Add the biases of the IMU, of which nothing may be known before."""
+    """Add the IMU's biases if the point lacks them."""
     biases = len(imu_sigmas(motion, spec))
     known = not biases or any(cause.name == IMU for cause in point.causes)
     return point if known else _add_causes(point, [Cause(IMU, biases, t_us)])

@@ -51,7 +51,7 @@ class PointProgress:
     Attributes:
         tally: The tally so far, of all segments.
         seeds: How many seeds count so far.
-        complete: No more seeds are needed.
+        is_complete: No more seeds are needed.
         found: How many of its tasks have results.
     """
 
@@ -60,18 +60,18 @@ class PointProgress:
     results: Mapping[str, Statistics]
     tally: Tally = field(default_factory=Tally)
     seeds: int = 0
-    complete: bool = False
+    is_complete: bool = False
     found: int = 0
 
     def __post_init__(self) -> None:
         self.advance(sum(task in self.results for task in self.tasks))
 
     def advance(self, found: int) -> None:
-        """Take in results that were added, so many."""
+        """Take in so many new results."""
         self.found += found
-        while not self.complete:
+        while not self.is_complete:
             if self.seeds == len(self.tasks) or self.rule.is_reached(self.tally):
-                self.complete = True
+                self.is_complete = True
             elif (result := self.results.get(self.tasks[self.seeds])) is not None:
                 self.tally += result.total()
                 self.seeds += 1
@@ -86,12 +86,12 @@ class PointProgress:
     @property
     def needed(self) -> int:
         """Tasks that count or may still."""
-        return self.seeds if self.complete else len(self.tasks)
+        return self.seeds if self.is_complete else len(self.tasks)
 
     @property
     def done(self) -> int:
-        """Number of those that are finished."""
-        return self.seeds if self.complete else self.found
+        """Number of finished tasks among these."""
+        return self.seeds if self.is_complete else self.found
 
 
 def collect_results(
@@ -127,7 +127,7 @@ def collect_results(
                 for task in job.tasks
                 if task.id not in results
                 and task.id not in started
-                and not all(point.complete for point in points_of[task.id])
+                and not all(point.is_complete for point in points_of[task.id])
             )
             if tasks:
                 started.update(task.id for task in tasks)
@@ -154,7 +154,7 @@ def _sum_progress(points: Sequence[PointProgress], faults: Sequence[tuple[Job, F
         tasks=sum(point.needed for point in points),
         done=sum(point.done for point in points),
         points=len(points),
-        points_done=sum(point.complete for point in points),
+        points_done=sum(point.is_complete for point in points),
         bits=sum(point.tally.bits for point in points),
         bit_errors=sum(point.tally.bit_errors for point in points),
         faults=tuple(faults),

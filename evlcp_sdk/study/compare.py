@@ -149,7 +149,7 @@ class _VariantRun:
         self.frames += frames_of(packets)
 
     def measure(self, name: str, truth: Truth | None, recorded_s: float, reading_s: float) -> Measurement:
-        """What it gave on a recording of that name, beside the truth if it is known."""
+        """Counts and times of its run on a recording, with the truth if it is known."""
         times = ProcessingTime(
             frame_us=tuple(self.timer.frame_us),
             stage_us={stage: tuple(us) for stage, us in self.timer.stage_us.items()},

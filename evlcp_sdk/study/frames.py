@@ -76,12 +76,12 @@ def read_frames(folder: Path | str) -> list[FrameRow]:
     if missing:
         raise InputError(f"{path}: without the columns {', '.join(missing)}")
     try:
-        return [_row(path, line, row) for line, row in rows]
+        return [_parse_row(path, line, row) for line, row in rows]
     except ConfigError as fault:
         raise InputError(str(fault)) from fault
 
 
-def _row(path: Path, line: int, row: Mapping[str, str | None]) -> FrameRow:
+def _parse_row(path: Path, line: int, row: Mapping[str, str | None]) -> FrameRow:
     def number(name: str, *, optional: bool = False) -> float:
         text = row.get(name)
         return math.nan if optional and not text else parse_csv_number(path, line, name, text)

@@ -92,7 +92,7 @@ def statistics_of(
 
 
 def count_without_truth(frames: Iterable[FrameRow], packets: int) -> Statistics:
-    """Count decoded frames of which it is unknown what was sent."""
+    """Count decoded frames without a truth."""
     frames = list(frames)
     direct = [frame for frame in frames if frame.echo_of is None]
     sigmas = [to_nm(f.sigma_m) for f in direct if not (math.isnan(f.distance_m) or math.isnan(f.sigma_m))]

@@ -23,7 +23,7 @@ from evlcp_sdk.values import Packet
 
 _PACKAGES = ("air", "link", "place", "plugin", "rx", "scene", "sim")
 _ON_AIR = ("air", "bar", "framing", "pilots", "modulation", "error-correction")
-"""Sections of a link for what a bar sends and from where, as far as its framing has them."""
+"""Sections of a link that determine what a bar sends, as far as its framing has them."""
 
 _UNUSED_SECTIONS = ("position", "camera_sigma")
 """Sections of a link that a receiver does not use."""

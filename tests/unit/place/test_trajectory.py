@@ -393,7 +393,7 @@ def test_a_drive_past_bars_tells_their_errors_and_its_own() -> None:
         squares += [((row.correction - truth[row.part, row.what]) / row.sigma) ** 2 for row in rows]
         table = {(row.part, row.what): row for row in rows}
         for key in (("camera", "focal_mm"), ("attitude", "time_us"), ("attitude", "heading_deg")):
-            assert table[key].determined
+            assert table[key].is_determined
             widths.append(table[key].sigma / table[key].stated_sigma)
         share, sigma = focal_share(last.standing("camera"), CAMERA, LENS)
         assert share == pytest.approx(table["camera", "focal_mm"].correction / CAMERA.focal_mm)
@@ -414,7 +414,7 @@ def test_what_a_drive_does_not_tell_keeps_its_sigma() -> None:
     angles = [("attitude", name) for name in ("pitch_deg", "roll_deg", "heading_deg")]
     assert list(found) == [("camera", "focal_mm"), *angles]
     for row in rows:
-        assert not row.determined
+        assert not row.is_determined
         assert row.sigma == pytest.approx(row.stated_sigma)
         assert row.correction == 0
     assert found["attitude", "heading_deg"].stated_sigma == 0.3
@@ -427,4 +427,4 @@ def test_biases_of_an_imu_are_taken_off() -> None:
     assert rows[0] == EstimatedBias(IMU, "rate_deg_s", -0.1, 0.05, 0.1)
     assert [row.what for row in rows[1:]] == ["push_right_m_s2", "push_forward_m_s2", "push_up_m_s2"]
     assert rows[2].correction == pytest.approx(0.1)
-    assert [row.determined for row in rows] == [True, False, True, False]
+    assert [row.is_determined for row in rows] == [True, False, True, False]
