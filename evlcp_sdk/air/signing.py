@@ -113,19 +113,21 @@ class TrustedKey:
     """
 
     key: Annotated[str, Field(description="The public key, 64 hex digits.")]
-    first_id: Annotated[int, Field(ge=0, lt=2**32, description="First transmitter id that it is for.")] = 0
-    last_id: Annotated[int, Field(ge=0, lt=2**32, description="Last transmitter id that it is for.")] = (
-        2**32 - 1
-    )
+    first_id: Annotated[
+        int, Field(ge=0, lt=2**32, description="First transmitter id that it may sign for.")
+    ] = 0
+    last_id: Annotated[
+        int, Field(ge=0, lt=2**32, description="Last transmitter id that it may sign for.")
+    ] = 2**32 - 1
     latitude_deg: Annotated[
-        float | None, Field(ge=-90, le=90, description="Centre of the area that it is for, WGS-84.")
+        float | None, Field(ge=-90, le=90, description="Latitude of the centre of its area, WGS-84.")
     ] = None
-    longitude_deg: Annotated[float | None, Field(ge=-180, le=180, description="The same.")] = None
+    longitude_deg: Annotated[float | None, Field(ge=-180, le=180, description="Its longitude.")] = None
     radius_m: Annotated[
-        float | None, Field(gt=0, le=2e7, description="Radius of the area; without the three, anywhere.")
+        float | None, Field(gt=0, le=2e7, description="Radius of the area; without these three, anywhere.")
     ] = None
     valid_from: Annotated[
-        str, Field(description="Time from which on it is valid, UTC unless it says; empty: always.")
+        str, Field(description="Time from which it is valid, UTC by default; empty: always.")
     ] = ""
     valid_to: Annotated[str, Field(description="Time until which it is valid, likewise.")] = ""
 

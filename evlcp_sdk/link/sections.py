@@ -28,21 +28,23 @@ class AirSpec:
 class MessageSpec:
     """How messages are read from packets, and whose beacons are verified."""
 
-    decode: Annotated[bool, Field(description="Read messages; without, packets are symbols only.")] = True
+    decode: Annotated[
+        bool, Field(description="Whether to read messages; without, packets are symbols only.")
+    ] = True
     combine_packets: Annotated[
         int,
-        Field(ge=0, le=256, description="Undecoded blocks kept to be added to their repetitions; 0: none."),
+        Field(ge=0, le=256, description="Undecoded blocks kept for combination with repetitions; 0: none."),
     ] = 16
     trusted_keys: Annotated[
         tuple[TrustedKey, ...],
         Field(description="Public Ed25519 keys whose beacons are verified, and what each may sign."),
     ] = ()
     revoked_keys: Annotated[
-        tuple[str, ...], Field(description="Public keys whose beacons are forged, whenever they were signed.")
+        tuple[str, ...], Field(description="Public keys whose beacons count as forged, whenever signed.")
     ] = ()
     max_age_s: Annotated[
         float,
-        Field(ge=0, description="Time from signature to reception up to which a beacon is verified; 0: any."),
+        Field(ge=0, description="Longest time from signature to reception of a verified beacon; 0: any."),
     ] = 0.0
     oldest_sequence: Annotated[
         int, Field(ge=0, lt=2**32, description="Sequence below which a signed beacon counts as replayed.")
@@ -73,22 +75,22 @@ class PositionSpec:
     """How positions are computed from the image points of bars at known places."""
 
     max_sigma_m: Annotated[
-        float, Field(gt=0, description="Largest sigma of a position, in any direction, that is given.")
+        float, Field(gt=0, description="Largest sigma, in any direction, of a position that is reported.")
     ] = 3.0
     false_alarm: Annotated[
         float,
-        Field(ge=1e-12, le=0.1, description="Chance that the tests of a fix find fault where there is none."),
+        Field(ge=1e-12, le=0.1, description="Probability that the tests of a faultless fix find a fault."),
     ] = 1e-4
     risk: Annotated[
         float,
-        Field(ge=1e-12, le=0.1, description="Chance of an error beyond a protection level, with a fault."),
+        Field(ge=1e-12, le=0.1, description="Probability of an error above a protection level with a fault."),
     ] = 1e-4
     bar_fault_m: Annotated[
         float,
         Field(
             ge=0,
-            description="How far a bar may stand from its site (sigma) without anybody's knowledge, so that"
-            " protection levels hold; 0: by any amount.",
+            description="Sigma of a bar's unknown displacement from its site, for which protection levels"
+            " hold; 0: any displacement.",
         ),
     ] = 0.0
     attitude_fault_deg: Annotated[
@@ -96,38 +98,38 @@ class PositionSpec:
         Field(
             ge=0,
             le=90,
-            description="How far an angle of the attitude may be off (sigma) without anybody's knowledge,"
-            " so that protection levels hold; 0: by any amount.",
+            description="Sigma of an unknown error of an attitude's angle for which protection levels hold;"
+            " 0: any error.",
         ),
     ] = 1.0
     focal_fault: Annotated[
         float,
-        Field(ge=0, le=1, description="The same of the focal length, as a share of it; 0: by any amount."),
+        Field(ge=0, le=1, description="The same of the focal length, as a share of it; 0: any error."),
     ] = 0.005
     max_protection_m: Annotated[
-        float, Field(gt=0, description="Protection level above which there is none.")
+        float, Field(gt=0, description="Largest protection level that is reported.")
     ] = 50.0
     beacons: Annotated[
         Literal["none", "verified", "any"],
         Field(
-            description="Beacons whose own place is believed where no site has their id;"
-            " with none, they do not contradict sites, either."
+            description="Beacons whose position is used if no site has their id; with none, they do not"
+            " contradict sites, either."
         ),
     ] = "verified"
     beacon_sigma_m: Annotated[
         float,
-        Field(ge=0, description="How precisely a beacon says its place (sigma, to the east, north and up)."),
+        Field(ge=0, description="Sigma of a beacon's position to the east, north and up."),
     ] = 0.1
-    rate_sigma_deg_s: Annotated[float, Field(gt=0, description="Bias of an IMU's rates (sigma).")] = 0.1
+    rate_sigma_deg_s: Annotated[float, Field(gt=0, description="Sigma of the bias of an IMU's rates.")] = 0.1
     gnss_sigma_m: Annotated[
         float,
         Field(
             ge=0,
             le=1e4,
-            description="Sigma of east and north of a fix in NMEA without GST, of up twice that; 0: none.",
+            description="Sigma of an NMEA fix without GST, east and north; up is twice that; 0: none.",
         ),
     ] = 0.0
     antenna_m: Annotated[
         tuple[float, float, float],
-        Field(description="The GNSS antenna's place from the camera: right, down, forward, m."),
+        Field(description="Position of the GNSS antenna from the camera: right, down, forward, m."),
     ] = (0.0, 0.0, 0.0)

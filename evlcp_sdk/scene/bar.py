@@ -76,7 +76,7 @@ class LedColumns:
     """
 
     columns: Annotated[int, Field(gt=0, le=64, description="How many columns.")] = 2
-    apart_m: Annotated[float, Field(ge=1e-6, le=100, description="From one column to the next.")] = 0.5
+    apart_m: Annotated[float, Field(ge=1e-6, le=100, description="Spacing of the columns.")] = 0.5
     rows: Annotated[int, Field(gt=0, le=4096, description="LEDs of a column.")] = 48
     led_pitch_m: Annotated[float, Field(ge=1e-6, le=100, description="Spacing of LEDs in a column.")] = 0.01
     cluster_rows: Annotated[int, Field(gt=0, description="LEDs of a cluster.")] = 6
@@ -145,8 +145,8 @@ class LedTable:
     leds: Annotated[
         tuple[tuple[_Metres, _Metres, _Metres, _Cluster], ...],
         Field(
-            description="LEDs [x, y, z, cluster]: to the right, down, and towards who looks at them, m,"
-            " from the transmitter's centre."
+            description="LEDs [x, y, z, cluster]: to the right, down, and towards the viewer, m, from the"
+            " transmitter's centre."
         ),
     ] = ((0.0, 0.0, 0.0, 0),)
     led_m: Annotated[float, Field(ge=1e-6, le=1, description="Width and height that one LED lights.")] = 0.005

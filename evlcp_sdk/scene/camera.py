@@ -51,9 +51,13 @@ class CameraModel:
     k1: Annotated[
         float, Field(ge=-10, le=10, description="Radial distortion by the square of the angle.")
     ] = 0.0
-    k2: Annotated[float, Field(ge=-100, le=100, description="The same by its fourth power.")] = 0.0
-    p1: Annotated[float, Field(ge=-1, le=1, description="Distortion of a lens tilted up or down.")] = 0.0
-    p2: Annotated[float, Field(ge=-1, le=1, description="Distortion of a lens tilted to a side.")] = 0.0
+    k2: Annotated[float, Field(ge=-100, le=100, description="Radial distortion by the fourth power.")] = 0.0
+    p1: Annotated[
+        float, Field(ge=-1, le=1, description="Tangential distortion of a lens tilted up or down.")
+    ] = 0.0
+    p2: Annotated[
+        float, Field(ge=-1, le=1, description="Tangential distortion of a lens tilted to a side.")
+    ] = 0.0
     k3: Annotated[float, Field(ge=-1000, le=1000, description="Radial distortion by the sixth power.")] = 0.0
 
     @cached_property
@@ -190,13 +194,13 @@ class CameraSigma:
         float, Field(ge=0, le=1e4, description="Standard deviation of the focal length; 0: exact.")
     ] = 0.0
     centre_x_px: Annotated[
-        float, Field(ge=0, le=1e4, description="Of the principal point's column; 0: exact.")
+        float, Field(ge=0, le=1e4, description="Standard deviation of the principal point's column.")
     ] = 0.0
-    centre_y_px: Annotated[float, Field(ge=0, le=1e4, description="Of its row.")] = 0.0
-    k1: Annotated[float, Field(ge=0, le=10, description="Of the radial distortion, likewise.")] = 0.0
-    k2: Annotated[float, Field(ge=0, le=100, description="The same.")] = 0.0
-    p1: Annotated[float, Field(ge=0, le=1, description="Of the distortion of a tilted lens.")] = 0.0
-    p2: Annotated[float, Field(ge=0, le=1, description="The same.")] = 0.0
+    centre_y_px: Annotated[float, Field(ge=0, le=1e4, description="Standard deviation of its row.")] = 0.0
+    k1: Annotated[float, Field(ge=0, le=10, description="Standard deviation of k1.")] = 0.0
+    k2: Annotated[float, Field(ge=0, le=100, description="Standard deviation of k2.")] = 0.0
+    p1: Annotated[float, Field(ge=0, le=1, description="Standard deviation of p1.")] = 0.0
+    p2: Annotated[float, Field(ge=0, le=1, description="Standard deviation of p2.")] = 0.0
     correlation: Annotated[
         tuple[tuple[float, ...], ...],
         Field(description="Correlations of these seven in this order, row by row; empty: none."),

@@ -36,19 +36,18 @@ class BarSite:
     [1.0, 0.0, 0.0]
     """
 
-    transmitter_id: Annotated[
-        int, Field(ge=0, lt=2**32, description="Number of the transmitter, as its beacon sends it.")
-    ]
-    latitude_deg: Annotated[float, Field(ge=-90, le=90, description="Of the bar's centre, WGS-84.")]
-    longitude_deg: Annotated[float, Field(ge=-180, le=180, description="The same.")]
+    transmitter_id: Annotated[int, Field(ge=0, lt=2**32, description="Transmitter id, as in its beacon.")]
+    latitude_deg: Annotated[float, Field(ge=-90, le=90, description="Latitude of the bar's centre, WGS-84.")]
+    longitude_deg: Annotated[float, Field(ge=-180, le=180, description="Its longitude.")]
     height_m: Annotated[
-        float, Field(ge=-12_000, le=20_000, description="The same, above the WGS-84 ellipsoid.")
+        float, Field(ge=-12_000, le=20_000, description="Its height above the WGS-84 ellipsoid.")
     ]
     heading_deg: Annotated[
-        float, Field(ge=0, lt=360, description="Where its top leans to, clockwise from north.")
+        float, Field(ge=0, lt=360, description="Direction to which its top tilts, clockwise from north.")
     ] = 0.0
     tilt_deg: Annotated[
-        float, Field(ge=0, le=180, description="Of its axis from the vertical; 90: lying, 180: upside down.")
+        float,
+        Field(ge=0, le=180, description="Tilt of its axis from the vertical; 90: lying, 180: upside down."),
     ] = 0.0
     length_m: Annotated[
         float,
@@ -60,26 +59,26 @@ class BarSite:
     ] = 0.96
     transmitter: Annotated[
         int | None,
-        Field(ge=0, description="Number that the receiver gives it, where no beacon sends its id."),
+        Field(ge=0, description="Number from the receiver, if no beacon sends its id."),
     ] = None
     link: Annotated[
         str | None,
-        Field(description="Name of the link that it sends with, where there are several; none: of any."),
+        Field(description="Name of its link, if there are several; none: any."),
     ] = None
     position_sigma_m: Annotated[
         float | None,
-        Field(ge=0, le=1000, description="Of its place, to the east, north and up each; none: exact."),
+        Field(ge=0, le=1000, description="Sigma of its position to the east, north and up; none: exact."),
     ] = None
     attitude_sigma_deg: Annotated[
-        float, Field(ge=0, le=180, description="Of a turn of the bar about each axis; 0: exact.")
+        float, Field(ge=0, le=180, description="Sigma of its rotation about each axis; 0: exact.")
     ] = 0.0
-    length_sigma_m: Annotated[float, Field(ge=0, le=10, description="Of its length; 0: exact.")] = 0.0
+    length_sigma_m: Annotated[float, Field(ge=0, le=10, description="Sigma of its length; 0: exact.")] = 0.0
     facing_deg: Annotated[
         float | None,
         Field(
             ge=0,
             lt=360,
-            description="Where its LEDs shine to, clockwise from north; for clusters that are not in line.",
+            description="Direction of its light, clockwise from north; for clusters not in line.",
         ),
     ] = None
 

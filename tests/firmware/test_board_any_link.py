@@ -209,7 +209,7 @@ def test_what_the_firmware_refuses(device, board):
 
 
 def test_what_hello_says_decides(board):
-    def says(**changes):
+    def change_hello(**changes):
         for name, value in changes.items():
             object.__setattr__(board.info, name, value)
 
@@ -221,11 +221,11 @@ def test_what_hello_says_decides(board):
         board.program(some_bank(link=panel))
     with pytest.raises(ConfigError, match=r"a link of 256 LEDs"):
         board.stream(panel)
-    says(leds=48, clusters=8)
+    change_hello(leds=48, clusters=8)
     with pytest.raises(ConfigError, match=r"a link of 87 LEDs, simulated: has 48"):
         board.program(a_bank())
     # a firmware of before says nothing of formats
-    says(leds=96, clusters=16, formats=0, minor=1)
+    change_hello(leds=96, clusters=16, formats=0, minor=1)
     with pytest.raises(IncompatibleError) as caught:
         board.program(a_bank())
     assert str(caught.value) == (

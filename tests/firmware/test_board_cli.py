@@ -30,7 +30,7 @@ class Emulated:
     def __init__(self, *options):
         command = [*EVLCP, "board", "emulate", *map(str, options)]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL)
-        self.said = self.process.stdout.readline()
+        self.first_line = self.process.stdout.readline()
 
     def end(self):
         self.process.send_signal(signal.SIGTERM)
@@ -265,7 +265,7 @@ def test_an_emulator_does_not_take_anothers_place(evlcp, native, tmp_path):
 
 def test_pty_and_tcp(evlcp, tmp_path):
     emulated = Emulated("native", "--listen", "pty", "--link", tmp_path / "tty")
-    assert emulated.said == f"listening on {tmp_path / 'tty'}\n"
+    assert emulated.first_line == f"listening on {tmp_path / 'tty'}\n"
     done = evlcp("board", "program", "--random", 64, "--port", tmp_path / "tty")
     assert (done.code, done.err) == (0, "")
     well(evlcp("board", "verify", "--random", 64, "--port", tmp_path / "tty"))

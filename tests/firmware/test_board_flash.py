@@ -148,7 +148,7 @@ def test_what_the_command_flashes_boots_where_it_was_flashed(evlcp, tmp_path):
     kept.write_bytes(random_image(1 << 20, 5).data)
     emulated = Emulated("rom", "--listen", port, "--flash", kept)
     try:
-        assert emulated.said == f"listening on {port}\n"
+        assert emulated.first_line == f"listening on {port}\n"
         done = well(evlcp("board", "flash", "--target", "stm32f405-8mhz", "--port", port, "--json"))
         table = json.loads(done.out)
         assert (table["verified"], table["started"], table["brown_out"]) == (True, True, False)

@@ -254,7 +254,7 @@ def test_emulate_serves_the_model(evlcp, stm32, tmp_path):
     listen, record, out = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "chips.npy"
     emulated = Emulated("stm32", "--listen", listen, "--leds", record)
     try:
-        assert emulated.said == f"listening on {listen}\n"
+        assert emulated.first_line == f"listening on {listen}\n"
         random = ("--random", 1, "--seed", 4, "--set", "air.frames_per_packet=2")
         for command in (("program", *random), ("stop",)):
             well(evlcp("board", *command, "--port", listen))

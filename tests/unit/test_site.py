@@ -75,7 +75,7 @@ def test_the_site_is_whole_and_asks_no_other_server(tmp_path: Path) -> None:
             assert browser.value(shown) is dark
             assert len(browser.requests) > 5
             assert all(url.startswith(("file:", "data:")) for url in browser.requests)
-        browser.open((site / "search.html").as_uri() + "?q=lean")
+        browser.open((site / "search.html").as_uri() + "?q=tilt")
         links = "[...document.querySelectorAll('#search-results li a')].map(a => a.href)"
         browser.until(f"{links}.length > 2")
         assert any("receiver.html" in link for link in browser.value(links))

@@ -134,11 +134,11 @@ FIVES = steps(lambda n: step_result(n, 5))
 CHIPS = "codebook codewords: expected a 2-D array of chips 0 and 1"
 CASES: dict[tuple[str, str], tuple[Any, str]] = {
     **{
-        ("framing", name): (make_algorithm(Uart, compile=how), says) for name, (how, says) in COMPILES.items()
+        ("framing", name): (make_algorithm(Uart, compile=how), text) for name, (how, text) in COMPILES.items()
     },
     **{
-        ("detection", name): (make_algorithm(Detection, compile=how), says)
-        for name, (how, says) in COMPILES.items()
+        ("detection", name): (make_algorithm(Detection, compile=how), text)
+        for name, (how, text) in COMPILES.items()
     },
     ("framing", "gives fives"): (make_algorithm(Uart, compile=FIVES), "gave int, expected DecodedFrame"),
     ("detection", "gives fives"): (make_algorithm(Detection, compile=FIVES), "gave int, expected Region"),
@@ -214,22 +214,22 @@ def test_it_is_one_line(role, id, evlcp, lamp_raw, demo_raw, tmp_path) -> None:
 
 
 def test_what_was_received_before_it_failed_is_kept(lamp_raw: Path, tmp_path: Path) -> None:
-    """Packets that were given before the fault are in the files, whose summary says why they end."""
+    """Packets that were given before the fault are in the files, whose summary gives the reason."""
 
     def gives(n: int) -> Any:
         return step_result(n, decoded_frame(float(n), packet=n - 8)) if n < 40 else boom()
 
     link = resolve({"bar": LAMP, "air": AIR, "framing": {"id": "uart"}, "detection": {"id": "whole"}})
     link = link.with_algorithm("framing", make_algorithm(Uart, compile=lambda *_: Steps(gives))(), id="mine")
-    says = "framing algorithm 'mine': KeyError: 'boom'"
-    with pytest.raises(PluginError, match=says):
+    message = "framing algorithm 'mine': KeyError: 'boom'"
+    with pytest.raises(PluginError, match=message):
         receive_to_folder(lamp_raw, tmp_path / "out", link)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["status"] == "failed"
-    assert summary["error"].startswith(says)
+    assert summary["error"].startswith(message)
     rows = rows_of(tmp_path / "out" / "frames.csv")
     assert 5 < len(rows) <= 32
     reception, packets = receive(lamp_raw, link), []
-    with pytest.raises(PluginError, match=says):
+    with pytest.raises(PluginError, match=message):
         packets += reception
     assert sum(len(packet.frames) for packet in packets) == len(rows)
