@@ -400,10 +400,10 @@ def check_columns(
         if name in known or not name:
             continue
         words = _split_words(name)
-        for expected, its in missing_words.items():
-            axes = words[:1] == its[:1] and first_words.count(words[:1]) >= 3
-            similarity = difflib.SequenceMatcher(None, "_".join(words), "_".join(its)).ratio()
-            if axes or similarity >= _MIN_SIMILARITY or sorted(words) == sorted(its):
+        for expected, expected_words in missing_words.items():
+            axes = words[:1] == expected_words[:1] and first_words.count(words[:1]) >= 3
+            similarity = difflib.SequenceMatcher(None, "_".join(words), "_".join(expected_words)).ratio()
+            if axes or similarity >= _MIN_SIMILARITY or sorted(words) == sorted(expected_words):
                 raise ConfigError(f"{path}: line 1: column {name!r:.40}: expected {expected}")
     missing = [name for name in needed if name not in names]
     if missing:
@@ -433,8 +433,8 @@ def parse_csv_number(
     except ValueError:
         value = math.nan
     if not abs(value) <= _MAX_NUMBER:
-        wanted = "a number" if not math.isfinite(value) else f"at most {_MAX_NUMBER:g}"
-        raise ConfigError(f"{path}: line {line}: {name} = {text!r:.40}: expected {wanted}")
+        expected_text = "a number" if not math.isfinite(value) else f"at most {_MAX_NUMBER:g}"
+        raise ConfigError(f"{path}: line {line}: {name} = {text!r:.40}: expected {expected_text}")
     low, high = within
     if not low <= value <= high:
         raise ConfigError(f"{path}: line {line}: {name} = {text!r:.40}: expected {low:g} to {high:g}")

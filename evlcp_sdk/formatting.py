@@ -43,8 +43,8 @@ def decode_characters(symbols: Iterable[int | None]) -> str:
 
 def sigmas(covariance: NDArray[np.float64]) -> list[float]:
     """Standard deviations of a covariance."""
-    found: list[float] = np.sqrt(np.diag(covariance)).tolist()
-    return found
+    deviations: list[float] = np.sqrt(np.diag(covariance)).tolist()
+    return deviations
 
 
 def integrity_fields(fix: Fix) -> dict[str, Any]:

@@ -17,5 +17,5 @@ class LazyModule:
         self.__dict__["__name__"] = name
 
     def __getattr__(self, name: str) -> Any:
-        found = self.__dict__[name] = getattr(import_module(self.__dict__["__name__"]), name)
-        return found
+        value = self.__dict__[name] = getattr(import_module(self.__dict__["__name__"]), name)
+        return value

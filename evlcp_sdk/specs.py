@@ -95,13 +95,13 @@ def _describe_error(
         return path, ": missing"
     rows = value if isinstance(value, list) and value else [value]
     tables = all(isinstance(row, Mapping) for row in rows)
-    given = "" if tables else f" = {format_value(value)}"
+    value_text = "" if tables else f" = {format_value(value)}"
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        return path, f"{given}: unknown {'table' if tables else 'key'}{unknown(path)}"
+        return path, f"{value_text}: unknown {'table' if tables else 'key'}{unknown(path)}"
     if kind in ("dataclass_type", "model_type", "dict_type"):
-        return path, f"{given}: expected a table"
+        return path, f"{value_text}: expected a table"
     text = error["msg"].replace("Input should be", "expected", 1).replace("a valid array", "a list")
-    return path, f"{given}: {re.sub(r'^[A-Z][a-z]+ should ', 'expected to ', text)}"
+    return path, f"{value_text}: {re.sub(r'^[A-Z][a-z]+ should ', 'expected to ', text)}"
 
 
 def _list_keys(cls: type[Any], path: Sequence[str]) -> list[str]:

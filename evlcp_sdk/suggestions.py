@@ -4,13 +4,13 @@ import difflib
 from collections.abc import Sequence
 
 
-def format_count(number: int, what: str) -> str:
+def format_count(number: int, noun: str) -> str:
     """A number of things, with separated thousands.
 
     >>> format_count(1, "frame"), format_count(4000, "frame")
     ('1 frame', '4,000 frames')
     """
-    return f"{number:,} {what}{'s' * (number != 1)}"
+    return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
 def suggest(word: str, known: Sequence[str], kind: str = "known") -> str:
@@ -19,8 +19,8 @@ def suggest(word: str, known: Sequence[str], kind: str = "known") -> str:
     >>> suggest("hight", ["height", "width"])
     "; did you mean 'height'? (known: height, width)"
     """
-    near = difflib.get_close_matches(word, known, n=1)
-    hint = f"; did you mean '{near[0]}'?" if near else ""
+    matches = difflib.get_close_matches(word, known, n=1)
+    hint = f"; did you mean '{matches[0]}'?" if matches else ""
     return f"{hint} ({kind}: {', '.join(known) or 'none'})"
 
 

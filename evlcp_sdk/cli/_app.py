@@ -31,25 +31,8 @@ Exit codes: [bold]0[/] done, also without a transmitter; [bold]1[/] failed; [bol
 
 
 _BUILT_IN = (
-    "receive",
-    "live",
-    "serve",
-    "convert",
-    "video",
-    "info",
-    "diagnose",
-    "compare",
-    "simulate",
-    "score",
-    "sweep",
-    "report",
-    "demo",
-    "calibrate",
-    "survey",
-    "config",
-    "plugins",
-    "check",
-    "warm_up",
+    *("receive", "live", "serve", "convert", "video", "info", "diagnose", "compare", "simulate", "score"),
+    *("sweep", "report", "demo", "calibrate", "survey", "config", "plugins", "check", "warm_up"),
 )
 """Modules of the built-in commands, each with the function of its name."""
 

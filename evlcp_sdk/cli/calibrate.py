@@ -52,43 +52,43 @@ def calibrate(
     link = load_link(link_file, overrides or [], registry)
     bars = load_sites(sites)
     known = read_poses(poses)
-    found = run.calibrate(
+    result = run.calibrate(
         recordings, bars, known, link, registry=registry, limit_px=limit_px, name=str(poses)
     )
     if as_json:
         print_json(
             {
-                "camera": {name: getattr(found.camera, name) for name in found.sigma},
-                "sigma": dict(found.sigma),
-                "camera_sigma": asdict(found.camera_sigma),
-                "not_determined_corner_px": dict(found.undetermined_px),
-                "views": found.views,
-                "points": found.points,
-                "misfit": found.misfit,
+                "camera": {name: getattr(result.camera, name) for name in result.sigma},
+                "sigma": dict(result.sigma),
+                "camera_sigma": asdict(result.camera_sigma),
+                "not_determined_corner_px": dict(result.undetermined_px),
+                "views": result.views,
+                "points": result.points,
+                "misfit": result.misfit,
                 "poses": len(known),
             }
         )
     else:
-        console().print(_to_toml(found, len(known)))
+        console().print(_to_toml(result, len(known)))
 
 
-def _to_toml(found: CalibrationResult, poses: int) -> str:
+def _to_toml(result: CalibrationResult, poses: int) -> str:
     """The tables `[camera]` and `[camera_sigma]`; as comments what was not determined."""
     lines = [
-        f"# {format_count(found.views, 'view')}, {format_count(found.points, 'point')},"
-        f" misses of {found.misfit**0.5:.2f} sigmas (rms)",
-        *([f"# {poses - found.views} of {poses} poses show no bar"] if poses > found.views else []),
+        f"# {format_count(result.views, 'view')}, {format_count(result.points, 'point')},"
+        f" misses of {result.misfit**0.5:.2f} sigmas (rms)",
+        *([f"# {poses - result.views} of {poses} poses show no bar"] if poses > result.views else []),
         "[camera]",
     ]
-    for name, sigma in found.sigma.items():
-        lines.append(f"{name} = {getattr(found.camera, name):.8g}  # +- {sigma:.2g}")
-    for name, corner in found.undetermined_px.items():
+    for name, sigma in result.sigma.items():
+        lines.append(f"{name} = {getattr(result.camera, name):.8g}  # +- {sigma:.2g}")
+    for name, corner in result.undetermined_px.items():
         lines.append(
             f"# {name}: not determined (the image's corners move by {corner:.1f} px within its sigma)"
         )
     lines += ["", "[camera_sigma]"]
-    for name in found.camera_sigma.__dataclass_fields__:
+    for name in result.camera_sigma.__dataclass_fields__:
         if name != "correlation":
-            lines.append(f"{name} = {getattr(found.camera_sigma, name):.6g}")
-    lines += ["correlation = [", *(f"  {list(row)}," for row in found.camera_sigma.correlation), "]"]
+            lines.append(f"{name} = {getattr(result.camera_sigma, name):.6g}")
+    lines += ["correlation = [", *(f"  {list(row)}," for row in result.camera_sigma.correlation), "]"]
     return "\n".join(lines)

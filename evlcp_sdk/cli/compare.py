@@ -130,11 +130,11 @@ def _compare_recordings(
         raise typer.BadParameter(f"{min(duplicates)} is named twice", param_hint="REC...")
     registry = Registry.load()
     variants = load_variants(texts, link_files, overrides, registry)
-    here = not workers or len(urls) == 1
-    executor = make_executor(0 if here else workers, None)
+    in_process = not workers or len(urls) == 1
+    executor = make_executor(0 if in_process else workers, None)
     tables: dict[str, Table] = {}
     code = 0
-    for outcome in executor.run(partial(_compare_recording, variants=variants, here=here), urls):
+    for outcome in executor.run(partial(_compare_recording, variants=variants, in_process=in_process), urls):
         if outcome.value is not None:
             tables[outcome.job] = outcome.value
         elif outcome.fault is not None:
@@ -144,10 +144,10 @@ def _compare_recordings(
     return code, comparison_of(ordered, variants, registry.versions())
 
 
-def _compare_recording(url: str, *, variants: tuple[Variant, ...], here: bool) -> Table:
+def _compare_recording(url: str, *, variants: tuple[Variant, ...], in_process: bool) -> Table:
     from evlcp_sdk.study.compare import compare_recording
 
-    with bytes_bar(Path(url).name) if here else nullcontext() as advance:
+    with bytes_bar(Path(url).name) if in_process else nullcontext() as advance:
         return compare_recording(url, variants, advance=advance or (lambda _done, _of: None))
 
 

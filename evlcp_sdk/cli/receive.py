@@ -103,11 +103,11 @@ def receive(
     }
     options["workers"] = cores
     decode = partial(_decode, clock=partial(camera.clock, place), lines=lines, **options)
-    here = dask is None and (not workers or len(jobs) == 1)
-    if lines is not None and not here:
+    in_process = dask is None and (not workers or len(jobs) == 1)
+    if lines is not None and not in_process:
         raise typer.BadParameter("are given by this process only", param_hint="--json-lines")
-    executor = make_executor(0 if here else workers or None, dask)
-    outcomes = _run_jobs(jobs, decode, executor, registry if here else None, result, lines)
+    executor = make_executor(0 if in_process else workers or None, dask)
+    outcomes = _run_jobs(jobs, decode, executor, registry if in_process else None, result, lines)
     raise typer.Exit(_exit_code(outcomes, strict=strict) or int(lines is not None and lines.failed))
 
 
@@ -133,7 +133,7 @@ def _run_jobs(
         progress_bar("recordings") if registry is None else nullcontext() as advance,
         ExitStack() as stack,
     ):
-        run = partial(decode, here=None if registry is None else (registry, stopped))
+        run = partial(decode, in_process=None if registry is None else (registry, stopped))
         for outcome in stack.enter_context(closing(executor.run(run, _take_until_stopped(stopped, jobs)))):
             outcomes.append(outcome)
             if advance is not None:
@@ -195,7 +195,7 @@ def _infer_job_link(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJ
 def _decode(
     job: ReceiveJob,
     *,
-    here: tuple[Registry, EndRequest] | None,
+    in_process: tuple[Registry, EndRequest] | None,
     links: tuple[Link, ...],
     clock: Callable[[], datetime | PulseClock | None],
     lines: LinePrinter | None,
@@ -206,8 +206,8 @@ def _decode(
     from evlcp_sdk.signals import stop_on_request
 
     run = partial(receive_to_folder, job.url, job.folder, job.link or links, clock_zero=clock(), **options)
-    if here is not None:
-        registry, stopped = here
+    if in_process is not None:
+        registry, stopped = in_process
         stop = stopped.or_when(lambda: job.folder is None and lines is not None and lines.closed)
         with bytes_bar(_source_name(job.url)) as advance:
             return run(registry=registry, lines=lines, advance=advance, stopped=stop)

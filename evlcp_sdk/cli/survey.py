@@ -63,34 +63,34 @@ def survey(
         ):
             if value is not None:
                 raise typer.BadParameter("needs --sites", param_hint=name)
-        found = run.survey(recordings, read_poses(poses), links, registry=registry, name=str(poses))
+        surveyed = run.survey(recordings, read_poses(poses), links, registry=registry, name=str(poses))
     else:
         plan = place.plan(links)
         assert plan is not None
         known = None if place.attitude_file is None else AttitudeLog.read(place.attitude_file)
-        found = run.survey_along_track(recordings, plan, links, attitude=known, registry=registry)
-    _write(found, out, as_json=as_json)
+        surveyed = run.survey_along_track(recordings, plan, links, attitude=known, registry=registry)
+    _write(surveyed, out, as_json=as_json)
 
 
-def _write(found: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None:
+def _write(surveyed: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None:
     from dataclasses import asdict
 
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.scene.sites import to_toml
 
     with Outputs() as outputs:
-        outputs.open(out).write(to_toml([bar.site for bar in found]))
+        outputs.open(out).write(to_toml([bar.site for bar in surveyed]))
         outputs.commit()
     if as_json:
         bars = [
             asdict(bar.site)
             | {"covariance_m2": bar.covariance_m2.tolist(), "views": bar.views}
             | ({"contradicted": bar.contradiction} if bar.contradiction else {})
-            for bar in found
+            for bar in surveyed
         ]
         print_json({"bars": bars})
     else:
-        for bar in found:
+        for bar in surveyed:
             console().print(_format_bar(bar))
 
 

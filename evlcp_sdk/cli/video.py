@@ -82,11 +82,11 @@ def _print_film(film: dict[str, Any], name: str) -> None:
     screen = console()
     if film["frames"]:
         transmitters = format_count(len(film["transmitters"]), "transmitter")
-        found = f"{transmitters}, {format_count(film['frames'], 'frame')}"
+        content = f"{transmitters}, {format_count(film['frames'], 'frame')}"
     else:
-        found = "no frame is decoded there"
+        content = "no frame is decoded there"
     screen.print(
-        f"{name}: {film['for_ms']:g} ms from {film['from_ms']:.1f} ms on, at 1/{film['slow']:g}; {found}"
+        f"{name}: {film['for_ms']:g} ms from {film['from_ms']:.1f} ms on, at 1/{film['slow']:g}; {content}"
     )
     screen.print(
         f"written: {film['film']}, {film['pictures']} pictures of {film['width']} x {film['height']} px,"

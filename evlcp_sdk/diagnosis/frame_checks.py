@@ -254,11 +254,11 @@ def check_orientation(facts: Facts, one: TransmitterTally) -> Findings:
     parts = along_px * along_m / max(math.hypot(*along_px) * math.hypot(*along_m), 1e-12)
     # A panel that is turned by a quarter looks mirrored, too: only a diagnosis reports it.
     mirrored = facts.has_survey and parts.min() < _MIRRORED
-    how = "upside down" if parts.sum() < _UPSIDE_DOWN else "mirrored" if mirrored else ""
-    if how:
+    orientation = "upside down" if parts.sum() < _UPSIDE_DOWN else "mirrored" if mirrored else ""
+    if orientation:
         yield Diagnostic(
             "turned",
-            f"its clusters stand the other way round, {how}; its symbols and distances are right,"
+            f"its clusters stand the other way round, {orientation}; its symbols and distances are right,"
             " positions are not",
             "turn the camera, or flip rows where it is read, unless the bar is mounted so (a column does not"
             " say whether left and right are mirrored, too)",
@@ -374,8 +374,8 @@ def check_distances(facts: Facts, one: TransmitterTally) -> Findings:
     due = (one.frames - one.echo_frames) / link.packet.pilot_every - facts.counts.get("frames_not_ranged", 0)
     text = f"{one.ranged_frames} of {max(due, one.ranged_frames):.0f} frames have a distance"
     if one.ranged_frames < _RANGED_SHARE * due:
-        why = "too few boundaries between clusters are seen, or their values do not fit the layout"
-        yield Diagnostic("few-distances", f"{text}: {why}", "another ranging.id may tolerate it")
+        reason = "too few boundaries between clusters are seen, or their values do not fit the layout"
+        yield Diagnostic("few-distances", f"{text}: {reason}", "another ranging.id may tolerate it")
     else:
         yield text
 
@@ -427,11 +427,11 @@ def check_length(facts: Facts, one: TransmitterTally) -> Findings:
     """The bar's length by its own beacon."""
     beacon_m, length_m = one.beacon_m, facts.link.bar.length_m
     if abs(beacon_m / length_m - 1) > _LENGTH_TOLERANCE:
-        how = f"{abs(length_m / beacon_m - 1):.0%} too {'long' if length_m > beacon_m else 'short'}"
+        error = f"{abs(length_m / beacon_m - 1):.0%} too {'long' if length_m > beacon_m else 'short'}"
         yield Diagnostic(
             "bar-length",
             f"its beacon says that the bar is {beacon_m:.3f} m long, the link {length_m:.3f}: its distances"
-            f" are {how} if the beacon is right",
+            f" are {error} if the beacon is right",
             "compare the link's [bar] with the transmitter's",
         )
 

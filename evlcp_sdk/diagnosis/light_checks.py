@@ -407,15 +407,15 @@ def check_preamble(facts: Facts) -> Findings:
     found, regions = counts.get("preambles", counts.get("frames", 0)), counts.get("regions_opened", 0)
     blinking = counts.get("events_in_regions", 0)
     if not found and (blinking >= _MANY_EVENTS or (facts.has_survey and has_preamble)):
-        code, what, compare = "no-frames", "frame is read", "[framing] with the transmitter's"
+        code, missing, compare = "no-frames", "frame is read", "[framing] with the transmitter's"
         if has_preamble:
-            code, what = "no-preamble", "preamble is detected"
+            code, missing = "no-preamble", "preamble is detected"
             compare = "[pilots] with the transmitter's; a panel or leaves behind a bar may mask it"
         ask = "" if facts.has_survey else "; `evlcp diagnose` says what blinks, and how fast"
         yield Diagnostic(
             code,
             f"something blinks, {format_count(blinking, 'event')} in {format_count(regions, 'region')},"
-            f" but no {what}",
+            f" but no {missing}",
             f"compare air.chip_rate_hz and {compare}{ask}",
         )
     elif has_preamble:

@@ -400,7 +400,7 @@ class PositionTally:
             "gnss_apart_m": None if offset_m is None else offset_m.round(3).tolist(),
             "frames_late": positioner.counts["frames_late"],
             "beacons_forged": positioner.counts["beacons_forged"],
-            "sites_contradicted": {str(n): how for n, how in positioner.bars.contradictions.items()},
+            "sites_contradicted": {str(n): reason for n, reason in positioner.bars.contradictions.items()},
             "learnt": [_describe_bias(one) for one in navigator.estimate_biases()],
             "origin": asdict(axes) if axes is not None else None,
             "bars_exact": [n for n, s in positioner.bars.known_sites.items() if s.position_sigma_m is None],

@@ -14,17 +14,8 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import Place
 
 FRAME_COLUMNS = (
-    "transmitter",
-    "packet",
-    "frame",
-    "t_us",
-    "symbols",
-    "quality",
-    "distance_m",
-    "distance_sigma_m",
-    "x_px",
-    "y_px",
-    "echo_of",
+    *("transmitter", "packet", "frame", "t_us", "symbols", "quality", "distance_m", "distance_sigma_m"),
+    *("x_px", "y_px", "echo_of"),
 )
 """Columns of every frame."""
 

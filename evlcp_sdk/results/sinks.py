@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import Placed, Settled
 
 
-def load_sinks(chosen: Sequence[InstalledSink]) -> list[tuple[InstalledSink, type[Sink]]]:
+def load_sinks(sinks: Sequence[InstalledSink]) -> list[tuple[InstalledSink, type[Sink]]]:
     """Import the classes of sinks.
 
     Raises:
@@ -29,7 +29,7 @@ def load_sinks(chosen: Sequence[InstalledSink]) -> list[tuple[InstalledSink, typ
         PluginError: One cannot be imported, or is not a sink.
     """
     classes = []
-    for installed in chosen:
+    for installed in sinks:
         cls = installed.load_class()
         if not issubclass(cls, Sink):
             raise PluginError(f"{installed}: {installed.record.target} is not a Sink")
