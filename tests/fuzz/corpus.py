@@ -28,7 +28,7 @@ from evlcp_sdk.values import Events, Triggers
 from firmware_host.board.bank import read_masks
 from firmware_host.board.fleet import read_inventory
 from firmware_host.board.symbols import read_symbols
-from firmware_host.board.update import Package
+from firmware_host.board.update import UpdatePackage
 from tests.unit.io.writers import write_hdf5, write_mat, write_mat_73, write_npy, write_sqlite
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -99,7 +99,7 @@ def summary_file(path):
         summarize(store)
 
 
-UPDATE = Package("stm32f405-8mhz", {1: bytes(range(200)), 2: bytes(range(100, 250))})
+UPDATE = UpdatePackage("stm32f405-8mhz", {1: bytes(range(200)), 2: bytes(range(100, 250))})
 NMEA = b"".join(
     f"${line}*{checksum(line)}\r\n".encode()
     for line in (
@@ -167,7 +167,7 @@ def kinds(folder, store):
         Kind("MCAP", "a.mcap", _recording(folder, "a.mcap"), read_recording),
         Kind("db3", "a.db3", _db3(folder), read_recording),
         Kind("NMEA", "a.nmea", NMEA, lambda path: read_nmea(path, datetime(2026, 11, 1, tzinfo=UTC), 3.0)),
-        Kind("update", "a.json", UPDATE.to_json().encode(), Package.read),
+        Kind("update", "a.json", UPDATE.to_json().encode(), UpdatePackage.read),
         Kind("truth", "a.truth.json", json.dumps(truth).encode(), read_truth),
         Kind("frames.csv", "frames.csv", FRAMES, lambda path: read_frames(path.parent)),
         Kind("summary.json", "summary.json", SUMMARY, lambda path: read_summary(path.parent)),
