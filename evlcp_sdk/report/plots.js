@@ -3,25 +3,25 @@
 const plots = JSON.parse(document.getElementById("plots").textContent);
 for (const [id, labels] of Object.entries(plots)) {
   const plot = document.getElementById(id), area = plot.querySelector(".area"), hidden = new Set();
-  const tip = document.createElement("div"), at = document.createElement("div");
-  tip.className = "tip"; at.className = "at";
-  tip.hidden = at.hidden = true;
-  area.append(at, tip);
-  const hide = () => { tip.hidden = at.hidden = true; };
+  const tip = document.createElement("div"), marker = document.createElement("div");
+  tip.className = "tip"; marker.className = "at";
+  tip.hidden = marker.hidden = true;
+  area.append(marker, tip);
+  const hide = () => { tip.hidden = marker.hidden = true; };
   const show = (event) => {
     const box = area.getBoundingClientRect();
     const x = event.clientX - box.left, y = event.clientY - box.top;
     let best = null, least = 40 * 40;
-    for (const one of labels) {
-      const dx = one[0] / 1000 * box.width - x, dy = one[1] / 1000 * box.height - y;
-      const away = dx * dx + dy * dy;
-      if (away < least && !hidden.has(one[3])) { least = away; best = one; }
+    for (const label of labels) {
+      const dx = label[0] / 1000 * box.width - x, dy = label[1] / 1000 * box.height - y;
+      const distance = dx * dx + dy * dy;
+      if (distance < least && !hidden.has(label[3])) { least = distance; best = label; }
     }
     if (best === null) { hide(); return; }
     const left = `${best[0] / 10}%`, top = best[1] / 1000 * box.height;
     tip.textContent = best[2];
-    tip.hidden = at.hidden = false;
-    at.style.left = left; at.style.top = `${best[1] / 10}%`;
+    tip.hidden = marker.hidden = false;
+    marker.style.left = left; marker.style.top = `${best[1] / 10}%`;
     // By shares: both stay within the chart when the page becomes narrower under a pointer that rests.
     tip.style.left = `max(0px, min(${left} + 12px, 100% - ${tip.offsetWidth}px))`;
     tip.style.top = `${top > tip.offsetHeight + 12 ? top - tip.offsetHeight - 10 : top + 12}px`;
