@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.place.bar_registry import BarRegistry
-    from evlcp_sdk.place.calibration import CalibrationResult, CalibrationView, KnownPose
+    from evlcp_sdk.place.calibration import Calibration, CalibrationView, KnownPose
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.place.observations import BarView
     from evlcp_sdk.place.survey import SurveyedBar
@@ -589,7 +589,7 @@ def calibrate(
     registry: Registry | None = None,
     limit_px: float = 2.0,
     name: str = "poses",
-) -> CalibrationResult:
+) -> Calibration:
     """Estimate focal length, principal point and distortion from bars at known places.
 
     `recordings` show bars at `sites`; `poses` are places and times of the camera, and `name` is the name in

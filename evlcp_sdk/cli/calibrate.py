@@ -12,7 +12,7 @@ from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, print_json
 from evlcp_sdk.suggestions import format_count
 
 if TYPE_CHECKING:
-    from evlcp_sdk.place.calibration import CalibrationResult
+    from evlcp_sdk.place.calibration import Calibration
 
 
 def calibrate(
@@ -72,7 +72,7 @@ def calibrate(
         console().print(_to_toml(result, len(known)))
 
 
-def _to_toml(result: CalibrationResult, poses: int) -> str:
+def _to_toml(result: Calibration, poses: int) -> str:
     """The tables `[camera]` and `[camera_sigma]`; as comments what was not determined."""
     lines = [
         f"# {format_count(result.views, 'view')}, {format_count(result.points, 'point')},"

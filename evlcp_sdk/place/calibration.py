@@ -157,7 +157,7 @@ class CalibrationView:
 
 
 @dataclass(frozen=True)
-class CalibrationResult:
+class Calibration:
     """A camera as calibrated.
 
     Attributes:
@@ -185,7 +185,7 @@ def fit_camera(
     spec: ErrorModel = DEFAULT_ERRORS,
     *,
     limit_px: float = 2.0,
-) -> CalibrationResult:
+) -> Calibration:
     """Fit the camera to all views.
 
     All parameters are fitted together, with the priors of usual lenses. One is determined if the views tell
@@ -240,7 +240,7 @@ def fit_camera(
     kept = replace(start, **changes)
     # A parameter that keeps its configured value is wrong by its distance from the fit, too.
     errors = np.array([getattr(kept, name) - getattr(found, name) for name in CAMERA_PARAMETERS])
-    return CalibrationResult(
+    return Calibration(
         replace(camera, **changes),
         {name: sigma[name] for name in determined},
         {name: corner[name] for name in CAMERA_PARAMETERS if name not in determined},

@@ -1,6 +1,4 @@
-"""Collection of a campaign's results: the tasks still needed, and the loop that runs them and keeps their
-results.
-"""
+"""Collection of a campaign's results: the loop that runs needed tasks and keeps their results."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing

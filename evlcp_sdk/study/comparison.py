@@ -377,11 +377,8 @@ def compare_links(summary: Summary) -> Comparison:
         labels = {k: v for k, v in series.labels.items() if k.startswith("link.")}
         settings = [f"{k.removeprefix('link.')}={v}" for k, v in labels.items()]
         identity = series.link if isinstance(series.link, Mapping) else {}
-        links[link] = {
-            "settings": settings,
-            "digest": identity.get("digest", ""),
-            "configuration": identity.get("table", {}),
-        }
+        resolved = {"digest": identity.get("digest", ""), "configuration": identity.get("table", {})}
+        links[link] = {"settings": settings} | resolved
         recordings = {f"seed {i}": one for i, one in enumerate(series.recordings)}
         rows = scenes.setdefault(scene, {})
         rows[link] = rows.get(link, Measurement()) + Measurement(recordings)

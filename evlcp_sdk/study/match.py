@@ -215,10 +215,9 @@ def find_sent_packets(bar: SentBar, truth: Truth) -> tuple[Floats, NDArray[np.bo
 
 
 def check_link(truth: Truth, link: Link | Mapping[str, Link], name: str, *, messages: bool = False) -> None:
-    """Check that each bar of the truth sends with a link of the receiver: a mismatch is an error, never a
-    wrong answer.
+    """Refuse a link that a bar of the truth does not send with, so that a mismatch is never a wrong answer.
 
-    With `messages`, also that their error correction is the same.
+    Of several links, each bar must send with one; with `messages`, also with their error correction.
 
     Raises:
         ConfigError: They differ; with the place.

@@ -158,8 +158,7 @@ def tally_positions(
     attitude: AttitudeLog | None,
     sites: Sequence[BarSite] | None = None,
 ) -> list[tuple[int, Tally]]:
-    """Tally positions and track by packets against the truth, each with the start of the nearest bar's
-    segment.
+    """Tally positions and track against the truth, each with the start of the nearest bar's segment.
 
     The image shows which transmitter stands where, so that no beacon is needed.
     """

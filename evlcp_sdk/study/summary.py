@@ -1,5 +1,4 @@
-"""Results of a campaign: one series for each combination of what it varies, one row for each segment of
-distance.
+"""Results of a campaign: one series for each combination of what it varies, with segments of distance.
 
 Recordings with the same seed have the same vibration, at whatever distance: a seed counts as one recording.
 """
@@ -292,10 +291,8 @@ def compare_with_paper(
             # A bound is compared with the largest figure of a segment.
             span = reference.from_m, reference.to_m
             spans = [(m, m + SEGMENT_M) for m in range(*span, SEGMENT_M)] if reference.bound else [span]
-            measured = [
-                (measure_figure(one.tallies_between(*part), reference.measure), part) for part in spans
-            ]
-            if nonempty := [pair for pair in measured if pair[0].count]:
+            figures = [(measure_figure(one.tallies_between(*s), reference.measure), s) for s in spans]
+            if nonempty := [pair for pair in figures if pair[0].count]:
                 ours, span = max(nonempty, key=lambda pair: pair[0].value)
                 comparisons.append(PaperComparison(reference, one.name, ours, *span))
     return comparisons

@@ -25,7 +25,7 @@ _PACKAGES = ("air", "link", "place", "plugin", "rx", "scene", "sim")
 _ON_AIR = ("air", "bar", "framing", "pilots", "modulation", "error-correction")
 """Sections of a link that determine what a bar sends, as far as its framing has them."""
 
-_UNUSED_SECTIONS = ("position", "camera_sigma")
+_UNUSED = ("position", "camera_sigma")
 """Sections of a link that a receiver does not use."""
 
 _STUDY = ("frames.py", "match.py", "measure.py", "tally.py", "task.py")
@@ -125,9 +125,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         world = task.scene.world
         attitude = None if world is None else attitude_log(task.scene, job.seed, simulation.path)
         # Reported sites and positions make no difference to what is received.
-        used = {
-            section: dict(keys) for section, keys in link.table.items() if section not in _UNUSED_SECTIONS
-        }
+        used = {section: dict(keys) for section, keys in link.table.items() if section not in _UNUSED}
         key = digest_of([used, None if world is None else asdict(replace(world, survey_sigma_m=0.0))])
         if key not in received:
             received[key] = Receiver(link, attitude=attitude), []

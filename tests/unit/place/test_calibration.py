@@ -11,13 +11,7 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.place.calibration import (
-    CalibrationResult,
-    CalibrationView,
-    _turn_slope,
-    fit_camera,
-    read_poses,
-)
+from evlcp_sdk.place.calibration import Calibration, CalibrationView, _turn_slope, fit_camera, read_poses
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel
@@ -49,7 +43,7 @@ def views(rng, count, known, noise_px=0.1, bars=6) -> list[CalibrationView]:
     return found
 
 
-def squares_of(found: CalibrationResult) -> list[float]:
+def squares_of(found: Calibration) -> list[float]:
     """Errors of what was determined, squared in their sigmas."""
     return [((getattr(found.camera, n) - getattr(TRUE, n)) / s) ** 2 for n, s in found.sigma.items()]
 

@@ -59,9 +59,8 @@ def test_bars_come_back_within_their_sigmas() -> None:
     rng = np.random.default_rng(8)
     squares, wide = [], []
     for _ in range(6):
-        found = survey_bars(
-            views(rng, 0.02, 0.05, 0.002), AXES, 0.96, CAMERA, CameraSigma(focal_mm=0.032), SPEC
-        )
+        seen = views(rng, 0.02, 0.05, 0.002)
+        found = survey_bars(seen, AXES, 0.96, CAMERA, CameraSigma(focal_mm=0.032), SPEC)
         assert [bar.site.transmitter_id for bar in found] == [7, 9]
         for bar, true in zip(found, BARS, strict=True):
             place = LocalAxes.of([true])
