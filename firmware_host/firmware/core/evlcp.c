@@ -45,8 +45,8 @@ static void end_led_test(struct evlcp *e)
 {
     if (!e->test.on)
         return;
-    hal_leds(dark, EVLCP_CHIP_DARK);
-    (void)hal_level(e->level_ma);
+    hal_show_leds(dark, EVLCP_CHIP_DARK);
+    (void)hal_set_level(e->level_ma);
     e->test.on = false;
 }
 
@@ -54,7 +54,7 @@ static void show_test_led(const struct evlcp *e)
 {
     uint8_t row[EVLCP_ROW_BYTES] = {0};
     row[e->test.led / 8u] = (uint8_t)(0x80u >> (e->test.led % 8u));
-    hal_leds(row, EVLCP_CHIP_TEST);
+    hal_show_leds(row, EVLCP_CHIP_TEST);
 }
 
 void evlcp_activate(struct evlcp *e, uint8_t bank)
@@ -81,7 +81,7 @@ bool evlcp_set_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma
     /* What plays meanwhile keeps to the lower of both. */
     if (duty < old)
         atomic_store(&e->player.guard.duty, duty);
-    if (!hal_level(level_ma))
+    if (!hal_set_level(level_ma))
         return false;
     e->level_ma = level_ma;
     atomic_store(&e->player.guard.duty, duty);
@@ -367,7 +367,7 @@ static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
     uint8_t bank = pending != EVLCP_NO_BANK ? pending : atomic_load(&e->banks.active);
     if (bank == EVLCP_NO_BANK || evlcp_stream_is_over(&e->banks.stream[bank]))
         return EVLCP_STATUS_NOTHING_COMMITTED;
-    hal_health(&e->health);
+    hal_read_health(&e->health);
     if ((e->health.faults & HOLDS_DARK) != 0u) {
         *detail = e->health.faults;
         return EVLCP_STATUS_HARDWARE_FAULT;
@@ -394,7 +394,7 @@ static enum evlcp_status on_start(struct evlcp *e, struct exchange *x)
     if (request.at_pulse != 0u) {
         uint8_t bank = atomic_load(&e->banks.active);
         uint32_t rate = bank != EVLCP_NO_BANK ? e->banks.plan[bank].setup.chip_rate_hz : e->setup.chip_rate_hz;
-        (void)hal_pulse(&pulse);
+        (void)hal_read_pulse(&pulse);
         /* It takes two pulses to know how far they are apart, and one that comes. */
         if ((int32_t)(request.at_pulse - pulse.count) < (pulse.between != 0u ? 1 : 3))
             return out_of_range(x, pulse.count + 3u);
@@ -445,7 +445,7 @@ static uint8_t current_state(struct evlcp *e)
 static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
 {
     struct evlcp_pulse pulse;
-    (void)hal_pulse(&pulse);
+    (void)hal_read_pulse(&pulse);
     struct evlcp_status_reply reply = {
         .state = current_state(e),
         .faults = fault_bits(e),
@@ -540,12 +540,12 @@ static enum evlcp_status on_led_test(struct evlcp *e, struct exchange *x)
         return out_of_range(x, EVLCP_LEDS - 1u);
     if (request.dwell_ms == 0u)
         return out_of_range(x, 1u);
-    hal_health(&e->health);
+    hal_read_health(&e->health);
     if ((e->health.faults & HOLDS_DARK) != 0u)
         return evlcp_refuse(EVLCP_STATUS_HARDWARE_FAULT, &x->detail, e->health.faults);
     /* A LED is on for as long as the host likes: with no more than the mean that it may have. */
     uint32_t most = (uint32_t)e->level_ma * evlcp_allowed_duty(e, e->level_ma, e->duty_limit) / 1000u;
-    if (!hal_level((uint16_t)most))
+    if (!hal_set_level((uint16_t)most))
         return evlcp_refuse(EVLCP_STATUS_HARDWARE_FAULT, &x->detail, 0u);
     e->test.on = true;
     e->test.led = request.first;
@@ -822,7 +822,7 @@ static void check_health(struct evlcp *e, uint32_t now)
     if (now - e->health_ms < HEALTH_EVERY_MS)
         return;
     e->health_ms = now;
-    hal_health(&e->health);
+    hal_read_health(&e->health);
     if ((e->health.faults & HOLDS_DARK) == 0u)
         return;
     e->latched |= e->health.faults & HOLDS_DARK;
@@ -850,8 +850,8 @@ static void step_led_test(struct evlcp *e, uint32_t now)
 void evlcp_init(struct evlcp *e)
 {
     /* The LEDs first: nothing may light them before a COMMIT. */
-    hal_leds(dark, EVLCP_CHIP_DARK);
-    hal_info(&e->info);
+    hal_show_leds(dark, EVLCP_CHIP_DARK);
+    hal_get_info(&e->info);
     evlcp_banks_init(&e->banks);
     evlcp_setup_init(&e->setup, e->info.tick_hz);
     e->watch.host_ms = e->watch.silence_from_ms = hal_millis();
@@ -859,7 +859,7 @@ void evlcp_init(struct evlcp *e)
         e->info.burst_chips = EVLCP_BURST_MOST;
     e->player.guard.burst = 1000u * e->info.burst_chips;
     (void)evlcp_set_light(e, e->info.level_default_ma, e->info.level_max_ma, 1000u);
-    hal_health(&e->health);
+    hal_read_health(&e->health);
     e->health_ms = hal_millis();
     evlcp_settings_load_key(e);
     struct evlcp_recall_reply recalled;
@@ -883,7 +883,7 @@ void evlcp_hardware_failed(struct evlcp *e)
     atomic_store(&e->player.want_play, false);
     evlcp_player_blank(&e->player);
     end_led_test(e);
-    hal_health(&e->health);
+    hal_read_health(&e->health);
     e->latched |= e->health.faults & HOLDS_DARK;
     if ((e->health.faults & HOLDS_DARK) == 0u)
         atomic_store(&e->player.chip_lost, true);
@@ -897,7 +897,7 @@ static bool is_start_due(struct evlcp *e)
     struct evlcp_when when = {.at = e->start.at_clock};
     if (e->start.at_pulse != 0u) {
         struct evlcp_pulse pulse;
-        (void)hal_pulse(&pulse);
+        (void)hal_read_pulse(&pulse);
         if (pulse.between == 0u)
             return false;
         when.at = pulse.at + (e->start.at_pulse - pulse.count) * pulse.between;
@@ -908,7 +908,7 @@ static bool is_start_due(struct evlcp *e)
     if ((int32_t)(when.at - hal_clock()) > (int32_t)(e->info.clock_hz / 1000000u * EVLCP_START_LEAD_US))
         return false;
     e->start.waiting = false;
-    hal_when(&when);
+    hal_schedule_start(&when);
     return true;
 }
 
@@ -920,7 +920,7 @@ void evlcp_poll(struct evlcp *e)
         answer(e, &datagram);
         (void)evlcp_link_flush(&e->link);
     }
-    uint32_t lost = hal_lost();
+    uint32_t lost = hal_lost_bytes();
     if (lost != 0u)
         atomic_fetch_add(&e->link.overflow_errors, lost);
     if (!is_running(e)) {
@@ -931,7 +931,7 @@ void evlcp_poll(struct evlcp *e)
             evlcp_player_begin(&e->player, &e->banks);
     }
     struct evlcp_pulse pulse;
-    if (!hal_pulse(&pulse) && is_running(e))
+    if (!hal_read_pulse(&pulse) && is_running(e))
         e->start.missed = true;
     check_watchdog(e, now);
     check_health(e, now);

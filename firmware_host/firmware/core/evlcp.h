@@ -22,8 +22,8 @@ struct evlcp_watch {
     uint32_t timeout_ms;
     uint32_t host_ms;         /* time of the latest request */
     uint32_t silence_from_ms; /* the same without HELLO */
-    bool fired;        /* it acts, until the next request */
-    bool acted;        /* it did, until the next control request */
+    bool fired;               /* it acts, until the next request */
+    bool acted;               /* it has acted, until the next control request */
 };
 
 struct evlcp_test {
@@ -81,7 +81,7 @@ struct evlcp {
 /* Begin, in memory that is zero: LEDs dark, no session; a flash slot saved with autostart is recalled and played. */
 void evlcp_init(struct evlcp *e);
 
-/* Bytes came in. */
+/* Bytes were received. */
 void evlcp_receive(struct evlcp *e, const uint8_t *bytes, uint32_t count);
 
 /* A chip is due. */
@@ -94,11 +94,11 @@ void evlcp_hardware_failed(struct evlcp *e);
 /* Everything that is not urgent. */
 void evlcp_poll(struct evlcp *e);
 
-/* Storing settings; see settings.c. */
+/* Saved settings; see settings.c. */
 enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct evlcp_save_reply *reply);
 enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, struct evlcp_recall_reply *reply);
 
-/* The key of the newest slot that is whole. */
+/* Load the key of the newest valid slot. */
 void evlcp_settings_load_key(struct evlcp *e);
 
 /* Share of time that a LED may be on with a current and a limit, permille. */

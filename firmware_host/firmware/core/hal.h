@@ -25,7 +25,8 @@ struct evlcp_hal_info {
 
 #define EVLCP_START_LEAD_US 2000u
 
-/* What the sensors say; a temperature of INT16_MIN is not measured. `faults` holds over_temperature, open_led and clock of enum evlcp_fault. */
+/* The sensors; a temperature of INT16_MIN is not measured. `faults` has over_temperature, open_led and clock of enum
+   evlcp_fault. */
 struct evlcp_health {
     int16_t temperature_dc;
     uint8_t faults;
@@ -39,7 +40,7 @@ struct evlcp_pulse {
     uint32_t between; /* from the one before, clocks */
 };
 
-/* When chips begin: with a pulse they stay in step with it. */
+/* The start of chips; with a pulse they stay in step with it. */
 struct evlcp_when {
     uint32_t at;       /* hal_clock */
     uint32_t pulse;    /* its number; 0: none */
@@ -47,26 +48,26 @@ struct evlcp_when {
     uint32_t chip_rate_hz;
 };
 
-/* Facts of the board. */
-void hal_info(struct evlcp_hal_info *info);
+/* The board's constants. */
+void hal_get_info(struct evlcp_hal_info *info);
 
 /* Show a row of LEDs, LED 0 the most significant bit of row[0]. `chip` is its number since START, or
    EVLCP_CHIP_DARK (blank: at once, or from the chip call when the rows before have had their time) or
    EVLCP_CHIP_TEST. The only output; nothing else lights a LED. */
-void hal_leds(const uint8_t *row, uint32_t chip);
+void hal_show_leds(const uint8_t *row, uint32_t chip);
 
-/* Call evlcp_chip every `ticks` from now on; 0 stops it, and no call comes after the return. Never called
+/* Call evlcp_chip every `ticks` from now on; 0 stops it: there is no call after the return. Never called
    while it runs except to stop it. */
-void hal_chips(uint32_t ticks);
+void hal_set_chip_clock(uint32_t ticks);
 
-/* The next hal_chips begins then, not at once; it is called up to EVLCP_START_LEAD_US before, and may wait. */
-void hal_when(const struct evlcp_when *when);
+/* The next hal_set_chip_clock begins then, not at once; it is called up to EVLCP_START_LEAD_US before, and may wait. */
+void hal_schedule_start(const struct evlcp_when *when);
 
 /* A clock that counts freely and wraps. */
 uint32_t hal_clock(void);
 
-/* The pulses so far. False: one is overdue, or came at a wrong time, since the last hal_when. */
-bool hal_pulse(struct evlcp_pulse *pulse);
+/* The pulses so far. False: one is overdue, or came at a wrong time, since the last hal_schedule_start. */
+bool hal_read_pulse(struct evlcp_pulse *pulse);
 
 /* Ticks between the moment the running chip call was due and now. */
 uint32_t hal_lateness(void);
@@ -74,20 +75,20 @@ uint32_t hal_lateness(void);
 /* Milliseconds since reset, free to wrap. */
 uint32_t hal_millis(void);
 
-/* Random numbers that nobody can foresee; false if the board has none. */
+/* Unpredictable random numbers; false if the board has none. */
 bool hal_random(uint8_t *bytes, uint32_t count);
 
 /* Take bytes to send; returns how many were taken, and never waits. */
 uint32_t hal_send(const uint8_t *bytes, uint32_t count);
 
 /* Bytes that the receiver hardware lost since the last call. */
-uint32_t hal_lost(void);
+uint32_t hal_lost_bytes(void);
 
 /* Set the LED current; false if the hardware does not follow. */
-bool hal_level(uint16_t level_ma);
+bool hal_set_level(uint16_t level_ma);
 
 /* Read the sensors. */
-void hal_health(struct evlcp_health *health);
+void hal_read_health(struct evlcp_health *health);
 
 /* Two flash slots of at least EVLCP_SLOT_BYTES each, and, with EVLCP_CAPABILITY_UPDATE, two more of
    EVLCP_IMAGE_SLOT_BYTES. Called only while no chip call runs. */
@@ -96,7 +97,7 @@ bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32
 bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count);
 
 /* The image that runs: 0 the one that was flashed, 1 or 2 one that came by an update. */
-uint8_t hal_running(void);
+uint8_t hal_running_image(void);
 
 /* Reset; it may return before that happens. */
 void hal_restart(void);

@@ -87,13 +87,13 @@ void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks)
         return; /* the end of a stream that has played */
     compose(player);
     atomic_store(&player->running, true);
-    hal_chips(plan->setup.ticks_per_chip);
+    hal_set_chip_clock(plan->setup.ticks_per_chip);
 }
 
 void evlcp_player_blank(struct evlcp_player *player)
 {
-    hal_chips(0u);
-    hal_leds(dark, EVLCP_CHIP_DARK);
+    hal_set_chip_clock(0u);
+    hal_show_leds(dark, EVLCP_CHIP_DARK);
     if (atomic_exchange(&player->running, false))
         player->dark_ms = hal_millis();
 }
@@ -105,7 +105,7 @@ void evlcp_player_chip(struct evlcp_player *player, struct evlcp_banks *banks)
         return;
     }
     /* First the output, so that its delay does not depend on what follows. */
-    hal_leds(player->row, player->chip);
+    hal_show_leds(player->row, player->chip);
     uint32_t late = hal_lateness();
     atomic_store(&player->lateness, late);
     if (late > atomic_load(&player->lateness_max))

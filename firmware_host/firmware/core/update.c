@@ -99,7 +99,7 @@ static uint8_t next_image(uint32_t *newest)
 {
     struct evlcp_image_seal seals[EVLCP_IMAGES];
     bool valid[EVLCP_IMAGES];
-    uint8_t running = hal_running();
+    uint8_t running = hal_running_image();
     *newest = 0u;
     for (uint8_t i = 0; i < EVLCP_IMAGES; i++) {
         valid[i] = has_valid_image(i, &seals[i]);
@@ -113,13 +113,13 @@ static uint8_t next_image(uint32_t *newest)
 
 static bool is_on_trial(void)
 {
-    uint8_t running = hal_running();
+    uint8_t running = hal_running_image();
     return running != 0u && !is_confirmed((uint8_t)(running - 1u));
 }
 
 void evlcp_update_fill_status(struct evlcp_update_status_reply *reply)
 {
-    reply->running = hal_running();
+    reply->running = hal_running_image();
     reply->trial = is_on_trial() ? 1u : 0u;
     reply->next = (uint8_t)(next_image(&reply->sequence) + 1u);
     reply->capacity = EVLCP_IMAGE_BYTES;
@@ -178,7 +178,7 @@ enum evlcp_status evlcp_update_commit(struct evlcp_update *u, uint32_t *sequence
 
 enum evlcp_status evlcp_update_confirm(void)
 {
-    uint8_t running = hal_running();
+    uint8_t running = hal_running_image();
     if (!is_on_trial())
         return EVLCP_STATUS_OK;
     return clear_word((uint8_t)(running - 1u), CONFIRMED_AT) ? EVLCP_STATUS_OK : EVLCP_STATUS_FLASH_FAULT;

@@ -7,7 +7,7 @@
 /* The HAL has no context argument, as on a board; here it is the board that runs on this thread. */
 static _Thread_local struct native *self;
 
-void hal_info(struct evlcp_hal_info *info)
+void hal_get_info(struct evlcp_hal_info *info)
 {
     *info = (struct evlcp_hal_info){
         .tick_hz = NATIVE_TICK_HZ,
@@ -24,7 +24,7 @@ void hal_info(struct evlcp_hal_info *info)
     memcpy(info->unique_id, self->unique_id, sizeof info->unique_id);
 }
 
-void hal_leds(const uint8_t *row, uint32_t chip)
+void hal_show_leds(const uint8_t *row, uint32_t chip)
 {
     memcpy(self->bench.shown, row, EVLCP_ROW_BYTES);
     if (self->bench.record_count == self->record_room) {
@@ -39,7 +39,7 @@ void hal_leds(const uint8_t *row, uint32_t chip)
     memcpy(record + 8, row, EVLCP_ROW_BYTES);
 }
 
-void hal_chips(uint32_t ticks)
+void hal_set_chip_clock(uint32_t ticks)
 {
     self->period = ticks;
     self->due = self->now + ticks;
@@ -53,7 +53,7 @@ void hal_chips(uint32_t ticks)
     self->due = self->begun + ticks;
 }
 
-void hal_when(const struct evlcp_when *when)
+void hal_schedule_start(const struct evlcp_when *when)
 {
     self->when = *when;
     self->waits = true;
@@ -64,7 +64,7 @@ uint32_t hal_clock(void)
     return (uint32_t)self->now;
 }
 
-bool hal_pulse(struct evlcp_pulse *pulse)
+bool hal_read_pulse(struct evlcp_pulse *pulse)
 {
     *pulse = self->pulse;
     return !self->in_step || (uint32_t)self->now - self->pulse.at < self->pulse.between / 2u * 3u;
@@ -117,19 +117,19 @@ bool hal_random(uint8_t *bytes, uint32_t count)
     return getrandom(bytes, count, 0) == (ssize_t)count;
 }
 
-uint32_t hal_lost(void)
+uint32_t hal_lost_bytes(void)
 {
     return 0u;
 }
 
-bool hal_level(uint16_t level_ma)
+bool hal_set_level(uint16_t level_ma)
 {
     if (!self->bench.level_fails)
         self->bench.level_ma = level_ma;
     return !self->bench.level_fails;
 }
 
-void hal_health(struct evlcp_health *health)
+void hal_read_health(struct evlcp_health *health)
 {
     *health = self->bench.health;
 }
@@ -189,7 +189,7 @@ bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t coun
     return true;
 }
 
-uint8_t hal_running(void)
+uint8_t hal_running_image(void)
 {
     return self->bench.running;
 }

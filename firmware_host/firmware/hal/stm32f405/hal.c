@@ -270,7 +270,7 @@ static uint32_t millis;
 static volatile uint32_t lost;
 static uint32_t reported_lost;
 
-void hal_info(struct evlcp_hal_info *info)
+void hal_get_info(struct evlcp_hal_info *info)
 {
     *info = (struct evlcp_hal_info){.tick_hz = CORE_HZ / TICK_CYCLES,
                                     .ticks_per_chip_max = 65536u / SLOTS_PER_CHIP,
@@ -411,7 +411,7 @@ static void wait_until_drained(void)
         check_chip_progress();
 }
 
-void hal_leds(const uint8_t *row, uint32_t chip)
+void hal_show_leds(const uint8_t *row, uint32_t chip)
 {
     if (chip == EVLCP_CHIP_TEST)
         wait_until_drained();
@@ -529,7 +529,7 @@ static void chips_start(uint32_t ticks)
         plan_steps();
 }
 
-void hal_chips(uint32_t ticks)
+void hal_set_chip_clock(uint32_t ticks)
 {
     if (ticks == 0u && in_chip) {
         /* The last row goes next, and stays its chip; the dark row follows, then rest. */
@@ -545,7 +545,7 @@ void hal_chips(uint32_t ticks)
         chips_start(ticks);
 }
 
-void hal_when(const struct evlcp_when *at)
+void hal_schedule_start(const struct evlcp_when *at)
 {
     when = *at;
     waits = true;
@@ -579,7 +579,7 @@ static void take_pulse(uint32_t at)
         plan_steps();
 }
 
-bool hal_pulse(struct evlcp_pulse *found)
+bool hal_read_pulse(struct evlcp_pulse *found)
 {
     if ((TIM_SR(TIM2) & TIM_CAPTURED) != 0u)
         take_pulse(TIM_CCR1(TIM2)); /* the read clears the flag */
@@ -633,7 +633,7 @@ bool hal_random(uint8_t *bytes, uint32_t count)
     return true;
 }
 
-uint32_t hal_lost(void)
+uint32_t hal_lost_bytes(void)
 {
     uint32_t total = lost;
     uint32_t since = total - reported_lost;
@@ -641,13 +641,13 @@ uint32_t hal_lost(void)
     return since;
 }
 
-bool hal_level(uint16_t level_ma)
+bool hal_set_level(uint16_t level_ma)
 {
     DAC_DHR12R1 = level_ma * DAC_FULL / LEVEL_MAX_MA;
     return true;
 }
 
-void hal_health(struct evlcp_health *health)
+void hal_read_health(struct evlcp_health *health)
 {
     *health = (struct evlcp_health){.temperature_dc = INT16_MIN};
     if ((GPIO_IDR(GPIOB) & PIN(1)) != 0u)
@@ -728,7 +728,7 @@ bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t coun
     return true;
 }
 
-uint8_t hal_running(void)
+uint8_t hal_running_image(void)
 {
     return EVLCP_IMAGE;
 }
