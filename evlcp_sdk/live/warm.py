@@ -13,8 +13,8 @@ from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.pose import solve_pose
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.rx.workers import has_bar_frames, load_decoder_kernels
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.values import Events
 
 _LENGTH_US = 30_000
 """Of the recording that comes with the SDK: three packets, of which two are whole."""
@@ -25,29 +25,28 @@ _PLACE: Final = (-2.0, 50.0, 0.5)
 
 
 def load_kernels(links: Sequence[Link], *, positions: bool = False) -> None:
-    """Load a receiver's kernels by receiving a piece of the recording that comes with the SDK.
+    """Load a receiver's kernels by frames of drawn bars and a piece of the recording that comes with the SDK.
 
-    Then again with vibration and half of the light, which needs the second reading of uncertain frames; and
-    compute a fix for those of `positions`.
+    Those of `positions` are loaded by a fix.
     """
-    if positions:
-        for link in links:
+    for link in links:
+        if has_bar_frames(link):
+            load_decoder_kernels(link)
+        if positions:
             _solve_bar_pose(link)
-    for vibrates in (False, True):
-        receiver, pictures, camera = Receiver(links), PictureSlot(), links[0].camera
-        with RawSource(find_shipped_file("recordings", "night-50m-30kmh-cut.raw")) as source:
-            first_us = None
-            for events in source.chunks(1 << 14):
-                first_us = int(events.t_us[0]) if first_us is None else first_us
-                events = _add_vibration(events) if vibrates else events
-                pictures.request()
-                pictures.add(events, camera.width, camera.height, receiver.regions)
-                if pictures.newest is not None:
-                    pictures.newest.to_image().to_png()
-                receiver.feed(events)
-                if int(events.t_us[0]) > first_us + _LENGTH_US:
-                    break
-        receiver.close()
+    receiver, pictures, camera = Receiver(links), PictureSlot(), links[0].camera
+    with RawSource(find_shipped_file("recordings", "night-50m-30kmh-cut.raw")) as source:
+        first_us = None
+        for events in source.chunks(1 << 14):
+            first_us = int(events.t_us[0]) if first_us is None else first_us
+            pictures.request()
+            pictures.add(events, camera.width, camera.height, receiver.regions)
+            if pictures.newest is not None:
+                pictures.newest.to_image().to_png()
+            receiver.feed(events)
+            if int(events.t_us[0]) > first_us + _LENGTH_US:
+                break
+    receiver.close()
 
 
 def _solve_bar_pose(link: Link) -> None:
@@ -56,10 +55,3 @@ def _solve_bar_pose(link: Link) -> None:
     points, _ = project_bars(along + _PLACE, np.zeros(3), attitude.rotation(), link.camera)
     view = BarView(0, along + _PLACE, points, np.full(len(points), 0.3))
     solve_pose([view], link.camera, attitude, ErrorModel.of(link.position), link.camera_sigma)
-
-
-def _add_vibration(events: Events) -> Events:
-    """Every second event, moved by two pixels to and fro in three milliseconds: within a frame."""
-    half = events[::2]
-    shift_px = np.rint(2 * np.sin(2 * np.pi / 3000 * half.t_us)).astype(np.int64)
-    return Events.of(half.t_us, half.x + shift_px, half.y, half.p)

@@ -60,7 +60,7 @@ class Workers:
         self._links = links
         for link in links.values():
             # Compiled here, where that is reported, and cached.
-            load_kernels(link)
+            load_decoder_kernels(link)
         self._workers = [_Worker(index, links) for index in range(1, number + 1)]
         for worker in self._workers:
             worker.receive(_START_S)
@@ -79,12 +79,7 @@ class Workers:
                 ", as a sink or plugin follows the stages" if has_announcer and processes > 0 else " or more"
             )
             raise ConfigError(f"workers: {processes}, expected 1{reason}")
-        # Links whose bars have frames that can be decoded by themselves.
-        shared = {
-            name: link
-            for name, link in links.items()
-            if link.algorithm("framing").roles >= STEPS and link.algorithm("detection").rhythmic
-        }
+        shared = {name: link for name, link in links.items() if has_bar_frames(link)}
         return cls(shared, processes - 1) if processes > 1 and shared else None
 
     def bar_decoders(self, link: str) -> list["_WorkerBarDecoder"]:
@@ -292,7 +287,7 @@ def _run_worker(pipe: Connection, memory: Any, links: Mapping[str, Link]) -> Non
     try:
         decoders = {name: LocalBarDecoder(FrameDecoder(link)) for name, link in links.items()}
         for link in links.values():
-            load_kernels(link)
+            load_decoder_kernels(link)
         pipe.send(None)
         while True:
             _wait_readable(poller, None)
@@ -336,7 +331,12 @@ def _measure_spread(result: FrameResult | None) -> None:
         result.reading.spread()
 
 
-def load_kernels(link: Link) -> None:
+def has_bar_frames(link: Link) -> bool:
+    """Whether a link's bars have frames that can be decoded by themselves."""
+    return link.algorithm("framing").roles >= STEPS and link.algorithm("detection").rhythmic
+
+
+def load_decoder_kernels(link: Link) -> None:
     """Decode two frames of a drawn bar, a clear one and one of few events: the first time takes a second."""
     book, rng = link.codebook, np.random.default_rng(0)
     layout = layout_of(link.bar.cluster_centres_m())
