@@ -104,7 +104,7 @@ def evlcp_open_writer(
         path: The file.
         width: Columns of the sensor, or None.
         height: Its rows, or None.
-        format: The format's name where one is asked for, whatever the file's; empty: as its suffix says.
+        format: Name of the requested format; empty: that of the file's suffix.
         outputs: As of `evlcp_sdk.io.open_writer`.
     """
 

@@ -53,7 +53,7 @@ class Attitude:
 
     Attributes:
         pitch_deg: How far the optical axis points above the horizon.
-        roll_deg: How far the camera's top leans to its right.
+        roll_deg: How far the camera's top tilts to its right.
         heading_deg: Where the optical axis points to, clockwise from north; None when unknown.
         gravity_sigma_deg: Standard deviation of the bias of pitch and of roll; 0: exact.
         heading_sigma_deg: Standard deviation of the heading's bias; 0: exact.
