@@ -386,23 +386,23 @@ class PacketFramer(Framer):
                 transmitter.grid.go_to(due.number + 1)
                 return
             if isinstance(found, Skipped):
-                transmitter.strayed = True
-                transmitter.grid.go_to(due.number + 1)
-                if found is not Skipped.DARK:
-                    self._record_light(transmitter, self._clock.camera_us(due.start_us))
-                    transmitter.missed[found] += 1
-                    known = transmitter.number is not None and due.number > transmitter.last_confirmed
-                    if found is Skipped.REJECTED and known:
-                        transmitter.unconfirmed[found] += 1
-                        transmitter.assembler.unconfirmed = True
-                self.counts[found] += 1
-                self._announce_skipped(transmitter, due, found)
-                continue
-            self._queue_frame(transmitter, due, found)
+                self._skip_frame(transmitter, due, found)
+            else:
+                self._queue_frame(transmitter, due, found)
 
-    def _announce_skipped(self, transmitter: Transmitter, due: DueFrame, why: Skipped) -> None:
-        packet = None if transmitter.first_packet is None else due.packet - transmitter.first_packet
+    def _skip_frame(self, transmitter: Transmitter, due: DueFrame, why: Skipped) -> None:
+        transmitter.strayed = True
+        transmitter.grid.go_to(due.number + 1)
         t_us = self._clock.camera_us(due.start_us)
+        if why is not Skipped.DARK:
+            self._record_light(transmitter, t_us)
+            transmitter.missed[why] += 1
+            known = transmitter.number is not None and due.number > transmitter.last_confirmed
+            if why is Skipped.REJECTED and known:
+                transmitter.unconfirmed[why] += 1
+                transmitter.assembler.unconfirmed = True
+        self.counts[why] += 1
+        packet = None if transmitter.first_packet is None else due.packet - transmitter.first_packet
         skipped = SkippedFrame(transmitter.number, packet, due.index, t_us, why.value, self._name)
         self._announcer.announce("skipped", skipped)
 
@@ -432,13 +432,12 @@ class PacketFramer(Framer):
             self._regions.drop(transmitter.region)
             self.forget_region(transmitter.region)
             return Skipped.REJECTED
-        attitude = self._attitude_at(self._clock.camera_us(due.middle_us)) if due.has_pilot else None
-        ranged = due.has_pilot and self._take_ranging_turn()
+        job = self._build_job(transmitter, due)
         known = transmitter.number is not None
         found, transmitter.state = self._decoder.read(
-            aligned, due, transmitter.state, attitude, ranged=ranged, known=known
+            aligned, due, transmitter.state, job.attitude, ranged=job.ranged, known=known
         )
-        self.counts["frames_not_ranged"] += due.has_pilot and not ranged
+        self.counts["frames_not_ranged"] += due.has_pilot and not job.ranged
         if not found.is_readable:
             self._add_count(transmitter, "frames_askew", found.reading.line_of_sight.askew)
             return Skipped.UNREAD
@@ -498,15 +497,12 @@ class PacketFramer(Framer):
             transmitter.decoder = min(self._bar_decoders, key=len)
             transmitter.decoder.put_state(transmitter.number, transmitter.state)
         due = self._retime_frame(transmitter, due)
-        ranged = due.has_pilot and self._take_ranging_turn()
-        middle_us = self._clock.camera_us(due.middle_us)
-        attitude = self._attitude_at(middle_us) if due.has_pilot else None
-        job = FrameJob(transmitter.region, due, attitude, ranged)
+        job = self._build_job(transmitter, due)
         fetch_result = transmitter.decoder.decode(transmitter.number, job)
         frame = None
         if transmitter.decoder.is_immediate and (found := fetch_result()) is not None:
             frame = self._publish_frame(transmitter, due, found)
-        self._pending.append(PendingFrame(transmitter, due, self._now_us, ranged, fetch_result, frame))
+        self._pending.append(PendingFrame(transmitter, due, self._now_us, job.ranged, fetch_result, frame))
         transmitter.grid.go_to(due.number + 1)
 
     def _pending_of(self, transmitter: Transmitter) -> list[PendingFrame]:
@@ -571,10 +567,14 @@ class PacketFramer(Framer):
         if transmitter.unconfirmed:
             transmitter.unconfirmed[name] += count
 
-    def _take_ranging_turn(self) -> bool:
-        """Whether this frame with a pilot, each `ranging_every`-th one, is to be ranged."""
+    def _build_job(self, transmitter: Transmitter, due: DueFrame) -> FrameJob:
+        """The job of decoding a frame; each `ranging_every`-th one with a pilot is ranged."""
+        if not due.has_pilot:
+            return FrameJob(transmitter.region, due, None, ranged=False)
         self._pilot_frames += 1
-        return self._pilot_frames % self.ranging_every == 0
+        attitude = self._attitude_at(self._clock.camera_us(due.middle_us))
+        ranged = self._pilot_frames % self.ranging_every == 0
+        return FrameJob(transmitter.region, due, attitude, ranged)
 
     def _align_frame(self, transmitter: Transmitter, due: DueFrame) -> AlignedFrame | None:
         """Align a frame and correct its region by it; drop duplicates of the bar, open its other images."""
