@@ -52,7 +52,7 @@ def to_upright(array: NDArray[Any]) -> NDArray[Any]:
 def choose_columns(
     path: Path,
     names: Sequence[str],
-    array: Callable[[str], Array],
+    load: Callable[[str], Array],
     fields: Fields | None,
     hint: str = "list:PATH?columns=t,p",
 ) -> tuple[list[Array], Fields]:
@@ -61,7 +61,7 @@ def choose_columns(
     Args:
         path: The file, for messages.
         names: Names of its arrays.
-        array: Returns the array of a name.
+        load: Returns the array of a name.
         fields: Which column is what; None recognizes it by names, or else by the first rows.
         hint: How to state the columns, for messages.
 
@@ -71,11 +71,11 @@ def choose_columns(
     found = fields or fields_from_names(names)
     if found is None and len(names) == 2:
         with suppress(InputError):  # one may be a table, the other something else
-            found = _fields_from_sample([array(name) for name in names])
+            found = _fields_from_sample([load(name) for name in names])
     if found is None or max(found.numbers) >= len(names):
-        named, found = _choose_table(path, names, array, fields, hint)
+        named, found = _choose_table(path, names, load, fields, hint)
     else:
-        named = [(names[k], array(names[k])) for k in found.numbers]
+        named = [(names[k], load(names[k])) for k in found.numbers]
     if any(column.shape == () for _, column in named[2:]):
         # One x or y is no column of events.
         found, named = replace(found, places=None), named[:2]
@@ -88,12 +88,12 @@ def choose_columns(
 
 
 def _choose_table(
-    path: Path, names: Sequence[str], array: Callable[[str], Array], fields: Fields | None, hint: str
+    path: Path, names: Sequence[str], load: Callable[[str], Array], fields: Fields | None, hint: str
 ) -> tuple[list[tuple[str, Array]], Fields]:
     """Return the columns of the first table in which they are recognized, short names first."""
     for name in sorted(names, key=len):
         try:
-            table = array(name)
+            table = load(name)
         except InputError:
             if len(names) == 1:
                 raise
@@ -172,7 +172,7 @@ def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
         raise InputError(f"{path}: {size} bytes are declared to unpack to {unpacked}, more than events can")
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="evlcp-"))
 
-    def array(name: str) -> NDArray[Any]:
+    def load(name: str) -> NDArray[Any]:
         try:
             file = archive.extract(f"{name}.npy", folder)
         except Exception as error:
@@ -180,19 +180,19 @@ def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
             raise InputError(f"{path}: array {name}: damaged: {format_error(error)}") from error
         return _map_array(f"{path}: array {name}", Path(file))
 
-    columns, found = choose_columns(path, names, array, fields)
+    columns, found = choose_columns(path, names, load, fields)
     pieces = split_pieces(columns, path.stat().st_size)
     if fields is not None or not set(COLUMNS) <= set(names):
         return EventTable("NPZ", pieces, found.unit)
     width, height = (
-        _read_scalar(path, name, array(name)) if name in names else None for name in ("width", "height")
+        _read_scalar(path, name, load(name)) if name in names else None for name in ("width", "height")
     )
     triggers: dict[str, Array] = {}
     if "trigger_t_us" in names:
         for name in TRIGGER_COLUMNS:
             if name not in names:
                 raise InputError(f"{path}: found the arrays {', '.join(sorted(names))}, expected {name} too")
-            triggers[name] = array(name)
+            triggers[name] = load(name)
     _check_lengths(path, triggers)
     edges = _read_triggers(path, triggers) if triggers else None
     return EventTable("NPZ", pieces, found.unit, size=(width, height), triggers=edges, window_us=WINDOW_US)

@@ -41,7 +41,7 @@ def describe_source(source: EventSource, name: str) -> dict[str, Any]:
         InputError: It cannot be read on.
     """
     first_us = last_us = None
-    parse_positive = 0
+    positive = 0
     window, in_window, peak = -1, 0, 0
     edges = np.zeros((256, 2), np.int64)
     for events, triggers in source.stream():
@@ -51,7 +51,7 @@ def describe_source(source: EventSource, name: str) -> dict[str, Any]:
             continue
         first_us = int(events.t_us[0]) if first_us is None else first_us
         last_us = int(events.t_us[-1])
-        parse_positive += int(events.p.sum(dtype=np.int64))
+        positive += int(events.p.sum(dtype=np.int64))
         windows, counts = np.unique(events.t_us // RATE_WINDOW_US, return_counts=True)
         for w, n in zip(windows.tolist(), counts.tolist(), strict=True):
             in_window = in_window + n if w == window else n
@@ -60,7 +60,7 @@ def describe_source(source: EventSource, name: str) -> dict[str, Any]:
     return summarize_source(source, name, first_us, last_us) | {
         "header": dict(source.header),
         "peak_events_per_s": round(peak * 1e6 / RATE_WINDOW_US),
-        "positive_share": round(parse_positive / total, 4) if total else None,
+        "positive_share": round(positive / total, 4) if total else None,
         "triggers": [
             {"channel": channel, "edge": ("falling", "rising")[value], "count": int(edges[channel, value])}
             for channel, value in np.argwhere(edges).tolist()

@@ -193,15 +193,15 @@ def _make_time_line(
     row = np.cumsum(kind == np.arange(sources)[:, None], axis=1)
     row += np.cumsum([0, *counts])[:-1, None]
     levels = np.zeros((sum(counts), most))
-    places = max((h.shape[1] for of in halos_of for h in of), default=1) + 1
+    places = max((light.shape[1] for halo in halos_of for light in halo), default=1) + 1
     halo = np.zeros((len(halos_of), sum(counts), places))
     begin = 0
     for i, count in enumerate(counts):
         levels[begin : begin + count, : levels_of[i].shape[1]] = levels_of[i]
-        for q, of in enumerate(halos_of):
-            halo[q, begin : begin + count, : of[i].shape[1]] = of[i]
+        for q, light in enumerate(halos_of):
+            halo[q, begin : begin + count, : light[i].shape[1]] = light[i]
         begin += count
-    pose, wipes, steps = (np.cumsum(kind == of) for of in (-2, -1, -3))
+    pose, wipes, steps = (np.cumsum(kind == code) for code in (-2, -1, -3))
     kind[kind == -3] = -1
     line = _kernels.TimeLine(when, kind, pose - 1, wiped[1][wipes], steps, row)
     return line, levels, halo
@@ -408,8 +408,8 @@ class Simulation:
         camera, sensor = self.scene.camera, self.scene.sensor
         size = camera.width * camera.height
         # A key of the block, a draw and a purpose, as in `hash_normal`.
-        mix_bits, key = cast(Any, _kernels.mix_bits).py_func, np.array([self._model.seed])
-        key = mix_bits(key + np.uint64(number) * np.array([_kernels.PIXEL_STEP], np.uint64))
+        mix, key = cast(Any, _kernels.mix_bits).py_func, np.array([self._model.seed])
+        key = mix(key + np.uint64(number) * np.array([_kernels.PIXEL_STEP], np.uint64))
         times, codes = [np.empty(0)], [np.empty(0, np.int64)]
         for purpose, rate_hz, population in (
             (10, 2 * sensor.noise_hz * size, size),
@@ -422,7 +422,7 @@ class Simulation:
             draws = np.arange(int(expected + 12 * math.sqrt(expected) + 64), dtype=np.uint64)
             words = key + draws * np.uint64(_kernels.DRAW_STEP)
             gap, place, sign = (
-                (mix_bits(words + np.uint64(purpose + k)) >> np.uint64(11)) / 2**53 for k in range(3)
+                (mix(words + np.uint64(purpose + k)) >> np.uint64(11)) / 2**53 for k in range(3)
             )
             t = np.cumsum(np.append(begin_us, -np.log(1.0 - gap) / rate))[1:]
             t = t[t < end_us]
@@ -475,8 +475,8 @@ class Simulation:
             counts = np.logical_and.reduceat(shown.reshape(len(t), 3, -1).all(1), blocks)
             step = np.diff(place.reshape(len(t), 3, -1, 2), axis=1)
             length = np.hypot(step[..., 0], step[..., 1]).max(1)
-            project_source = np.where(counts[np.arange(len(t)) // _CELLS], length, 0.0)
-            moved = np.maximum(moved, project_source.max(1))
+            shown_px = np.where(counts[np.arange(len(t)) // _CELLS], length, 0.0)
+            moved = np.maximum(moved, shown_px.max(1))
         motion = self.scene.motion
         most = _MOST_MOVES_STRUCK if motion.pothole_s or motion.yaw_rate_deg_s else _MOST_MOVES
         moves = np.clip(np.ceil(2 * moved / MOTION_STEP_PX), 1, most).astype(int)
@@ -534,7 +534,7 @@ class Simulation:
         of_block = slice(*np.searchsorted(stretch.starts_us, (begin_us, end_us)))
         starts, attitude = stretch.starts_us[of_block], stretch.attitude[of_block]
         turn = np.stack([attitude[:, 0], -attitude[:, 1]], 1) * camera.focal_px
-        wiped, changed = (cut_changes(*of, begin_us, end_us) for of in (stretch.wiped, stretch.changed))
+        wiped, changed = (cut_changes(*both, begin_us, end_us) for both in (stretch.wiped, stretch.changed))
         lightest = float(wiped[1].max())
         light = np.append(sensor.dark_w_m2, scene.background.light_w_m2 * changed[1])
         darkest = float(light[0] + light[1:].min() * float(self._darkest_texture * wiped[1].min()))
@@ -594,8 +594,8 @@ class Simulation:
             when, levels = cut_changes(*sent, begin_us, end_us)
             switches.append(when)
             levels_of.append(levels)
-            for of, share in zip(halos_of, footprint.halos, strict=True):
-                of.append(levels @ share)
+            for lights, share in zip(halos_of, footprint.halos, strict=True):
+                lights.append(levels @ share)
         line, levels, halo = _make_time_line(starts, wiped, changed[0], switches, levels_of, halos_of, most)
         world = (
             line,

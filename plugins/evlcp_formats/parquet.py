@@ -21,10 +21,10 @@ class FramesParquet(Sink):
         import pyarrow.parquet
 
         super().__init__(folder, run)
-        integer, number = pyarrow.int64(), pyarrow.float64()
-        types = [integer, integer, integer, number, pyarrow.list_(integer), *[number] * 5, integer]
+        integer, real = pyarrow.int64(), pyarrow.float64()
+        types = [integer, integer, integer, real, pyarrow.list_(integer), *[real] * 5, integer]
         self._columns = frame_columns(filtered=run.filtered, links=bool(run.links))
-        types += [number] * (len(self._columns) - len(types))
+        types += [real] * (len(self._columns) - len(types))
         if self._columns[-1] == LINK_COLUMN:
             types[-1] = pyarrow.string()
         self._schema = pyarrow.schema(list(zip(self._columns, types, strict=True)))

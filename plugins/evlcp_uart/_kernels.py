@@ -41,7 +41,7 @@ def compute_bit_evidence(
         many += counts[0, m : m + len(out)] + counts[1, m : m + len(out)]
     of_gains = np.empty((many.max() + 1 if len(out) else 0, contexts))
     is_known = np.zeros(len(of_gains), np.bool_)
-    score = np.empty(contexts)
+    loglik = np.empty(contexts)
     least = math.log(outlier)
     for s in range(len(out)):
         events = many[s]
@@ -58,20 +58,20 @@ def compute_bit_evidence(
             of_gains[events, c] = most + math.log(total)
         is_known[events] = True
         for c in range(contexts):
-            score[c] = of_gains[events, c]
+            loglik[c] = of_gains[events, c]
         for polarity in range(2):
             for m in range(width):
                 k = counts[polarity, s + m]
                 if k:
                     for c in range(contexts):
-                        score[c] += k * logs[polarity, m, c]
-        top = score[0]
+                        loglik[c] += k * logs[polarity, m, c]
+        top = loglik[0]
         for c in range(contexts):
-            top = max(top, score[c])
+            top = max(top, loglik[c])
         for c in range(contexts):
             # Lower ones are negligible against an outlier.
-            near = score[c] > top - _NEGLIGIBLE
-            out[s, c] = math.log((1 - outlier) * math.exp(score[c] - top) + outlier) if near else least
+            near = loglik[c] > top - _NEGLIGIBLE
+            out[s, c] = math.log((1 - outlier) * math.exp(loglik[c] - top) + outlier) if near else least
         last = out[s, contexts - 1]
         for c in range(contexts):
             out[s, c] -= last

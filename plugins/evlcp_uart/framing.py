@@ -116,15 +116,11 @@ def read_characters(
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """The state of the decoder and of the packets.
+    """The state of the decoder, characters before the first known start of a packet, and the place of
+    packets.
 
-    Attributes:
-        decoder: State of the decoder.
-        waiting: Characters before the first known start of a packet.
-        grid: Start of the first character of a packet, us, and the number of the packet.
-        last: Packet and place of the last character.
-        end_us: End of the last character.
-        pauses: Whether the stated pause was seen.
+    `grid` is the start of the first character of a packet, us, and the number of the packet; `last` are
+    packet and place of the last character, `end_us` its end; `pauses`: the stated pause was seen.
     """
 
     decoder: CharacterState

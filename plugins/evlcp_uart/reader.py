@@ -154,15 +154,15 @@ class CharacterReader:
         values = self.characters.likelihoods(evidence[starts[:, None] + places]).argmax(1)
         logs = light.logs - np.log(light.rates.mean((0, 2)))[None, :, None]
         logs = logs[self.characters.contexts[values]]
-        known_from = stretch.windows
         found = starts.copy()
         breaks = np.flatnonzero(np.abs(np.diff(starts) - length) > NEAR + 1) + 1
         shifts = np.arange(-NEAR - 1, NEAR + 2)
         for run in np.split(np.arange(len(starts)), breaks):
-            begun = starts[run] - length * np.arange(len(run))
-            mean = _sum_neighbours(begun[:, None])[:, 0] / _sum_neighbours(np.ones((len(run), 1)))[:, 0]
+            phases = starts[run] - length * np.arange(len(run))
+            mean = _sum_neighbours(phases[:, None])[:, 0] / _sum_neighbours(np.ones((len(run), 1)))[:, 0]
             at = np.rint(mean + length * np.arange(len(run))).astype(np.int64)[:, None] + shifts
-            windows = known_from[np.clip(at[:, :, None] + places, 0, most)].reshape(len(run), len(shifts), -1)
+            windows = stretch.windows[np.clip(at[:, :, None] + places, 0, most)]
+            windows = windows.reshape(len(run), len(shifts), -1)
             fit = (windows @ logs[run].reshape(len(run), -1, 1))[..., 0]
             best = at[np.arange(len(run)), _sum_neighbours(fit).argmax(1)]
             found[run] = np.clip(best, 0, len(evidence) - 1 - int(places[-1]))
