@@ -317,8 +317,7 @@ def _read_chips(path: Path, clusters: int) -> NDArray[np.uint8]:
         raise ConfigError(
             f"{path}: {chips.dtype} {chips.shape}, expected 0 and 1 in an array (chips, {clusters} clusters)"
         )
-    found: NDArray[np.uint8] = chips.astype(np.uint8)
-    return found
+    return chips.astype(np.uint8)
 
 
 def _longest_run(chips: NDArray[np.uint8]) -> int:

@@ -66,8 +66,7 @@ def pack_sensor(sensor: SensorSpec) -> Floats:
 def tabulate_quantiles(nodes: int = 4097) -> Floats:
     """Tabulate the quantiles of the cut-off normal distribution at even steps of probability."""
     edge = ndtr(-_kernels.NOISE_LIMIT)
-    table: Floats = ndtri(edge + np.linspace(0, 1, nodes) * (1 - 2 * edge))
-    return table
+    return ndtri(edge + np.linspace(0, 1, nodes) * (1 - 2 * edge))
 
 
 def seed_key(seed: int) -> np.uint64:
@@ -78,8 +77,7 @@ def seed_key(seed: int) -> np.uint64:
 def pack_requests(t_us: Floats, code: NDArray[np.int32], begin_us: float) -> NDArray[np.int64]:
     """Pack requests into words, with their times since `begin_us` to the nearest tick, int64 (n,)."""
     ticks = np.rint((t_us - begin_us) * _kernels.TICKS).astype(np.int64)
-    words: NDArray[np.int64] = ticks << _kernels.CODE_BITS | code
-    return words
+    return ticks << _kernels.CODE_BITS | code
 
 
 def _draw_texture(scene: Scene) -> Floats:
@@ -154,8 +152,7 @@ class _Halo:
         """Return the share of each cluster's light along a strip with these cuts, float64 (clusters, n)."""
         grid = np.arange(-self.reach_px, cuts_px[-1] + self.reach_px, 1 / self.per_px)
         edge = self.edge_share(grid[:, None] - cuts_px)
-        shares: Floats = (edge[:, :-1] - edge[:, 1:]).T
-        return shares
+        return (edge[:, :-1] - edge[:, 1:]).T
 
 
 def _make_time_line(

@@ -324,8 +324,7 @@ def _spread_events(counts: NDArray[np.int32], ticks: int) -> NDArray[np.int32]:
     ) // ticks
     # Events beyond the ends stay inside.
     until[:, -1] = total[:, -1]
-    found: NDArray[np.int32] = np.diff(until, axis=1, prepend=0).astype(np.int32)
-    return found
+    return np.diff(until, axis=1, prepend=0).astype(np.int32)
 
 
 def _drop_chance_characters(found: list[Character]) -> list[Character]:

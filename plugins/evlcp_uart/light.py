@@ -98,8 +98,7 @@ class Light:
             prior = np.tile(found, (2, 1, 1))
             found = (events + known[:, None, None] * prior) / (windows + known)[:, None, None]
         floor = _FLOOR * float(mean.mean()) + 1e-5
-        rates: Floats = _smooth_rates(found) + floor
-        return rates
+        return _smooth_rates(found) + floor
 
     @cached_property
     def share(self) -> float:
@@ -111,8 +110,7 @@ class Light:
     @cached_property
     def logs(self) -> Floats:
         """Logarithm of the rates, float64 (C, 2, TICKS)."""
-        found: Floats = np.log(self.rates)
-        return found
+        return np.log(self.rates)
 
     @cached_property
     def means(self) -> Floats:
@@ -251,5 +249,4 @@ def _normalize_likelihoods(logs: Floats) -> Floats:
 
 def _smooth_rates(rates: Floats) -> Floats:
     padded = np.pad(rates, ((0, 0), (0, 0), (len(_BLUR) // 2,) * 2), mode="edge")
-    found: Floats = np.lib.stride_tricks.sliding_window_view(padded, len(_BLUR), 2) @ _BLUR
-    return found
+    return np.lib.stride_tricks.sliding_window_view(padded, len(_BLUR), 2) @ _BLUR
