@@ -128,8 +128,7 @@ class CameraSource(RawSource):
 
     @property
     def health(self) -> Mapping[str, float | int | str]:
-        """As `EventSource.health`: `temperature_c`, `backlog` (USB packets that wait), `dropped`,
-        `overflows`.
+        """As `EventSource.health`: `temperature_c`, `backlog` (waiting USB packets), `dropped`, `overflows`.
 
         At an overflow the driver's ring is full (its clutch engaged), and packets are dropped until it is
         read.

@@ -279,8 +279,7 @@ def _merge_triggers(
 
 
 def _unwrap_times(times: NDArray[Any], before: int | None, gone_round: int) -> tuple[NDArray[Any], int, int]:
-    """Unwrap the times of a counter of 32 or 24 bits, after a time and wraps by `gone_round`; others stay as
-    they are.
+    """Unwrap the times of a counter of 32 or 24 bits that wrapped by `gone_round` before.
 
     Returns:
         The times, how often they wrapped, and by how much the counter has wrapped in all.

@@ -83,8 +83,8 @@ def open_list(url: Path | str, read: TableReader | None = None) -> ColumnSource:
 
 def _parse_order(text: str) -> Fields:
     names = [name.strip().lower() for name in text.split(",")]
-    given = [name for name in names if name != "-"]
-    if sorted(given) not in (["p", "t"], ["p", "t", "x", "y"]):
+    stated = [name for name in names if name != "-"]
+    if sorted(stated) not in (["p", "t"], ["p", "t", "x", "y"]):
         raise ValueError(
             "t and p, or t, x, y and p, in the order of the columns, - for others, such as t,-,p"
         )

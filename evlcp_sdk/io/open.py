@@ -103,12 +103,12 @@ _OPENERS: Final[dict[str, Callable[[str], EventSource]]] = {
 }
 
 
-def _ask_plugins(registry: Registry, hook: str, kind: type[T], **given: Any) -> T | None:
+def _ask_plugins(registry: Registry, hook: str, kind: type[T], **arguments: Any) -> T | None:
     """Return the first answer of a plugin's hook, or None; a plugin that fails is left out."""
-    subject = str(next(iter(given.values())))
+    subject = str(next(iter(arguments.values())))
     for impl in reversed(getattr(registry.hook, hook).get_hookimpls()):
         try:
-            answer: object = impl.function(*(given[name] for name in impl.argnames))
+            answer: object = impl.function(*(arguments[name] for name in impl.argnames))
         except EvlcpError:
             raise
         except (Exception, SystemExit) as fault:
@@ -216,9 +216,9 @@ def open_writer(
     if name == "CSV":
         return CsvWriter(path, width, height, outputs)
     if name not in CODECS:
-        given = {"path": Path(path), "width": width, "height": height, "format": format or ""}
+        arguments = {"path": Path(path), "width": width, "height": height, "format": format or ""}
         registry = Registry.load() if registry is None else registry
-        writer = _ask_plugins(registry, "evlcp_open_writer", EventWriter, **given, outputs=outputs)  # type: ignore[type-abstract]
+        writer = _ask_plugins(registry, "evlcp_open_writer", EventWriter, **arguments, outputs=outputs)  # type: ignore[type-abstract]
         if writer is not None:
             return writer
         found = f"format {format!r}" if format else f"suffix {suffix!r}"

@@ -235,16 +235,16 @@ def _run_filtered(i: int, t_us: float, until: float, batch: Batch, model: PixelM
         if abs(y - settled) < 1e-5 and abs(z - settled) < 1e-5:
             t = limit
             continue
-        whole = min(length, limit - t)
-        last = whole == limit - t
-        middle = -math.log(rest + (u_base - rest) * math.exp(-rate * (t + 0.5 * whole - t_us)))
-        end = -math.log(rest + (u_base - rest) * math.exp(-rate * (t + whole - t_us)))
-        if abs(middle - 0.5 * (y + end)) > 2e-3 and whole > 1e-3:
-            length = 0.5 * whole
+        piece = min(length, limit - t)
+        last = piece == limit - t
+        middle = -math.log(rest + (u_base - rest) * math.exp(-rate * (t + 0.5 * piece - t_us)))
+        end = -math.log(rest + (u_base - rest) * math.exp(-rate * (t + piece - t_us)))
+        if abs(middle - 0.5 * (y + end)) > 2e-3 and piece > 1e-3:
+            length = 0.5 * piece
             continue
-        length = min(2.0 * whole, tau)
-        half = 0.5 * whole
-        then = limit if last else t + whole
+        length = min(2.0 * piece, tau)
+        half = 0.5 * piece
+        then = limit if last else t + piece
         if not armed:
             low, high = -math.inf, math.inf
         for k in range(2):
@@ -742,7 +742,7 @@ def _run_batch(
 ) -> None:
     """Run a batch of `size` (lanes, pixels), with its mask and its stride in `of_batch`, through a block."""
     line, strips, halos, near, scenery = world
-    shining, lit, mine = room
+    shining, lit, entries = room
     lanes, _ = size
     mask, stride = of_batch
     f, poses, many = batch.f, scenery.turn_px.shape[0], 0
@@ -751,15 +751,15 @@ def _run_batch(
         lit[many], shining.clusters[many, 2] = g, -1
         many += int((mask >> np.uint64(g)) & np.uint64(1))
     # The changes for this batch: those of its sources, and every stride of poses.
-    own, pose, sampled, dark = 0, -1, -1, scenery.light[0]
+    count, pose, sampled, dark = 0, -1, -1, scenery.light[0]
     for e in range(line.t_us.size):
         what = line.kind[e]
         is_own = (mask >> np.uint64(max(what, 0))) & np.uint64(what >= 0)
-        mine[own] = e
-        own += int(is_own) | (what == -1) | ((what == -2) & (line.pose[e] % stride == 0))
-    for q in range(own):
-        e = mine[q]
-        t_us, until = line.t_us[e], line.t_us[mine[q + 1]] if q + 1 < own else end_us
+        entries[count] = e
+        count += int(is_own) | (what == -1) | ((what == -2) & (line.pose[e] % stride == 0))
+    for q in range(count):
+        e = entries[q]
+        t_us, until = line.t_us[e], line.t_us[entries[q + 1]] if q + 1 < count else end_us
         before, pose = pose, line.pose[e] // stride * stride
         # The places of the sources are those in the middle of these poses.
         here = min(pose + stride // 2, poses - 1)
@@ -987,7 +987,7 @@ def read_out(
     for i in range(height):
         tail[i], follow[size + i] = size + i, -1
     # Events as words: column, number in the row, polarity.
-    together = np.empty(size, np.int64)
+    row_events = np.empty(size, np.int64)
     # One bit for each waiting row.
     waits = np.zeros((height >> 6) + 1, np.uint64)
     hold = pending.size > 0
@@ -1048,14 +1048,14 @@ def read_out(
             # Sorted by column, then by arrival; without a branch, which could not be predicted.
             event = np.int64(x) << 32 | (n - begin) << 1 | what & 1
             for j in range(begin, n):
-                other = together[np.uint64(j)]
-                together[np.uint64(j)] = min(other, event)
+                other = row_events[np.uint64(j)]
+                row_events[np.uint64(j)] = min(other, event)
                 event = max(other, event)
             last = np.uint64(n)
-            together[last], out_t[last], out_y[last] = event, stamp, at_row
+            row_events[last], out_t[last], out_y[last] = event, stamp, at_row
             n += 1
     for j in range(n):
-        out_x[j], out_p[j] = together[j] >> 32, together[j] & 1
+        out_x[j], out_p[j] = row_events[j] >> 32, row_events[j] & 1
     left = _compact_requests(words, follow, i, pending)
     memory[0], memory[1], memory[2], memory[3] = free, at_row, window, used
     return n, dropped, held, left

@@ -19,8 +19,7 @@ Floats = NDArray[np.float64]
 
 
 def blur_of(depth_m: float, lens: LensSpec, camera: CameraModel, more_px: float = 0.0) -> Blur:
-    """Return the image of a point: diffraction with or without its wings, defocus, and the blur left in
-    focus.
+    """Return the image of a point: diffraction, defocus, and the blur left in focus.
 
     With wings, an ideal f/2 lens at 630 nm without other blur spreads 5.1 % of the light beyond 1 px of 4.86
     um, and 2.6 % beyond 2 px. `more_px` is the sigma of additional blur.

@@ -76,8 +76,8 @@ def _round_rows(rows: Floats, digits: int) -> list[list[float]]:
     return [[round(value, digits) for value in row] for row in rows.tolist()]
 
 
-def _pick_fields(given: object, *names: str) -> dict[str, Any]:
-    return {name: getattr(given, name) for name in names}
+def _pick_fields(description: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(description, name) for name in names}
 
 
 def _describe_bar(light: BarLight, duration_s: float) -> dict[str, Any]:

@@ -89,8 +89,7 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
 
 
 def survey_sites(scene: Scene, seed: int, registry: Registry | None = None) -> tuple[BarSite, ...]:
-    """Return the sites of the bars as a survey reports them: with its errors, and with faults it is not aware
-    of.
+    """Return the sites of the bars as a survey reports them, with its errors, known and unknown.
 
     Raises:
         ConfigError: The scene has no `[world]`, a bar's link is not valid, or its `site_of` is no bar.

@@ -50,9 +50,9 @@ def _expect_bits(bits: Any, length: int, name: str) -> None:
     expect((bits <= 1).all(), f"{name} of 0 and 1 only")
 
 
-def _expect_refusal(call: Any, given: NDArray[Any], what: str) -> None:
+def _expect_refusal(call: Any, argument: NDArray[Any], what: str) -> None:
     try:
-        call(given)
+        call(argument)
     except ConfigError:
         return
     expect(False, f"ConfigError from {what}")

@@ -86,9 +86,9 @@ def _check_compile(subject: Subject) -> None:
 @law("inputs-kept", "arrays that it is given stay as they were")
 def _check_inputs_kept(subject: Subject) -> None:
     task = make_exercise(subject)
-    given = map_arrays(task.inputs, np.copy)
-    task.prepare()(*given)
-    expect_same(given, task.inputs, "inputs to stay as they were", name="input")
+    copies = map_arrays(task.inputs, np.copy)
+    task.prepare()(*copies)
+    expect_same(copies, task.inputs, "inputs to stay as they were", name="input")
 
 
 def _expect_same_from(subject: Subject, change: Callable[[NDArray[Any]], NDArray[Any]], kind: str) -> None:

@@ -41,10 +41,10 @@ def _permute_pilots(book: Codebook) -> tuple[NDArray[np.int64], Codebook]:
 def _check_separation_shapes(subject: Subject) -> None:
     link, separate = link_of(subject), compile_subject(subject)
     sums, k = pilot_sums(link, missing=0.2), link.codebook.clusters
-    for given in (sums, sums[:, :-3, :-1]):
-        found = separate(given)
+    for image in (sums, sums[:, :-3, :-1]):
+        found = separate(image)
         expect(isinstance(found, PresenceMap), f"a PresenceMap, got {type(found).__name__}")
-        _, height, width = given.shape
+        _, height, width = image.shape
         grid = found.grid_px
         expect(isinstance(grid, int) and grid >= 1, f"grid_px as a whole number of pixels, got {grid!r}")
         cells = (k, height // grid, width // grid)
@@ -101,8 +101,7 @@ SEPARATION = (
 
 
 def _compile_decoders(subject: Subject) -> Iterator[tuple[Codebook, Decode]]:
-    """Yield the codebooks of the SDK's modulations and the link's that the subject accepts, and it compiled
-    for each.
+    """Compile the subject for the modulations of the SDK and of the link that it accepts.
 
     Raises:
         InapplicableLawError: It accepts none.

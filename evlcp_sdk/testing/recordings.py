@@ -59,8 +59,7 @@ def ideal_events(
     missing: float = 0.1,
     t0_us: int = 0,
 ) -> Events:
-    """Return the events of an ideal sensor: some of each pixel for each edge, delayed, jittered, some
-    missing.
+    """Return the events of an ideal sensor: some per pixel and edge, delayed, jittered, some missing.
 
     Args:
         link: The link, with codebook, packet format and the size of the sensor.

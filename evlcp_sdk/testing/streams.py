@@ -78,7 +78,7 @@ def _step_times(events: Events) -> list[int]:
 
 def _check_any_split(subject: Subject) -> None:
     link, machine = _compile_machine(subject)
-    given, events = _RESULTS[subject.role], _make_recording(subject, link)
+    kind, events = _RESULTS[subject.role], _make_recording(subject, link)
     wanted = feed_events(machine, events, _step_times(events))
     last = int(events.t_us[-1]) + 1
     rng = np.random.default_rng(0)
@@ -89,13 +89,13 @@ def _check_any_split(subject: Subject) -> None:
     }
     for how, until_us in cuts.items():
         got = feed_events(machine, events, [*until_us, last + _FLUSH_US])
-        expect_same(got, wanted, f"the same {given} from events fed {how} as every 1500 us", _SAME, given)
+        expect_same(got, wanted, f"the same {kind} from events fed {how} as every 1500 us", _SAME, kind)
 
 
 @law("state-kept", "a step leaves the state it is given, which can be pickled")
 def _check_state_kept(subject: Subject) -> None:
     link, machine = _compile_machine(subject)
-    given, events = _RESULTS[subject.role], _make_recording(subject, link)
+    kind, events = _RESULTS[subject.role], _make_recording(subject, link)
 
     def branch(state: Any, piece: Events, until_us: int) -> Any:
         # A branch that is given up, and a pickled state.
@@ -105,7 +105,7 @@ def _check_state_kept(subject: Subject) -> None:
         return pickle.loads(pickle.dumps(state))
 
     got, wanted = (feed_events(machine, events, _step_times(events), keep) for keep in (branch, None))
-    expect_same(got, wanted, f"branches and pickling not to change the state: the same {given}", name=given)
+    expect_same(got, wanted, f"branches and pickling not to change the state: the same {kind}", name=kind)
 
 
 @law("clean", "no error in the events of an ideal sensor, every frame in its place")
@@ -249,9 +249,9 @@ def _check_filter_shapes(subject: Subject) -> None:
         state = follow.init()
         expect(follow.predict(state, 0.0) is None, f"{name}: a prediction of None before any measurement")
         for i, value in enumerate(_make_noisy_line(n, 5)):
-            given = value.copy()
-            state, filtered, sigma = follow.step(state, i * FRAME_US, given, 0.1)
-            expect((given == value).all(), f"{name}: the measurement to stay as it was")
+            measurement = value.copy()
+            state, filtered, sigma = follow.step(state, i * FRAME_US, measurement, 0.1)
+            expect((measurement == value).all(), f"{name}: the measurement to stay as it was")
             predicted = follow.predict(state, (i + 1) * FRAME_US)
             expect(predicted is not None, f"{name}: a prediction after a measurement")
             for values, spread, what in ((filtered, sigma, "step"), (*predicted, "predict")):

@@ -110,8 +110,7 @@ class BagSource(RawSource):
 
 
 class _PacketOrder:
-    """Sorts the packets of a bag by their numbers, each once; a number far below starts anew, as a driver
-    does.
+    """Sorts packets by their numbers, each once; a number far below starts anew, as a driver does.
 
     Attributes:
         twice: Number of repeated packets, which are left out.

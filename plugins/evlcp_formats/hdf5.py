@@ -151,8 +151,7 @@ def _is_hard_link(group: Any, name: str) -> bool:
 
 
 def _check_dataset(path: Path, dataset: Any) -> None:
-    """Check that a data set is in the file itself, and takes no more room or time than a file of its size
-    may.
+    """Check that a data set is in the file itself, and no larger than a file of its size may hold.
 
     Raises:
         InputError: It is not, or takes more.

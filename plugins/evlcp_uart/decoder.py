@@ -1,5 +1,4 @@
-"""Decode characters from the events of a group of pixels: a maximum-likelihood receiver that learns its
-light.
+"""Decode characters from the events of a group of pixels by a receiver that learns the light.
 
 An edge of the light triggers a burst of events of one polarity, late and with a tail; a light that moves or
 shimmers triggers events of both as long as it is on. The receiver learns from the stream itself, without
@@ -136,8 +135,7 @@ class CharacterDecoder:
     def step(
         self, state: CharacterState, t_us: Ticks, p: NDArray[np.uint8], until_us: float
     ) -> tuple[CharacterState, list[Character]]:
-        """Count the events before `until_us`, after which none of them may come; decode what is certain by
-        then.
+        """Count the events before `until_us`, and decode what is certain by then.
 
         `t_us` are ascending times, int64 (n,), `p` polarities, uint8 (n,). The given state is not changed.
         """
@@ -300,14 +298,14 @@ def _find_bunch_spacing(counts: NDArray[np.int32]) -> int:
     """Return the spacing in ticks of the bunches in which a camera reads events out; 1 without bunches."""
     total = counts.sum(0)
     at = np.flatnonzero(total)
-    many, apart = total[at], np.diff(at)
-    near = apart <= _BUNCH_TICKS
+    many, gaps = total[at], np.diff(at)
+    near = gaps <= _BUNCH_TICKS
     if not near.any() or (many * many).sum() < _BUNCH_EVENTS * many.sum():
         return 1
     weights = np.minimum(many[:-1], many[1:])[near]
-    order = np.argsort(apart[near], kind="stable")
+    order = np.argsort(gaps[near], kind="stable")
     half = np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)
-    return int(apart[near][order][half])
+    return int(gaps[near][order][half])
 
 
 def _spread_events(counts: NDArray[np.int32], ticks: int) -> NDArray[np.int32]:
@@ -329,9 +327,9 @@ def _spread_events(counts: NDArray[np.int32], ticks: int) -> NDArray[np.int32]:
 
 def _drop_chance_characters(found: list[Character]) -> list[Character]:
     """Drop first characters that are few before a pause and of low quality, as noise gives them."""
-    apart = np.diff([one.t_us for one in found])
-    length = float(np.median(apart)) if len(apart) else np.inf
-    paused = np.flatnonzero(apart > 1.5 * length) + 1
+    gaps = np.diff([one.t_us for one in found])
+    length = float(np.median(gaps)) if len(gaps) else np.inf
+    paused = np.flatnonzero(gaps > 1.5 * length) + 1
     if len(paused) and (few := int(paused[0])) < LEAST_CHARACTERS:
         sure = float(np.mean([one.quality for one in found[:few]]))
         return found[few:] if sure < _LEAST_FIRST_QUALITY else found

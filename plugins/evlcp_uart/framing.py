@@ -116,8 +116,7 @@ def read_characters(
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """The state of the decoder, characters before the first known start of a packet, and the place of
-    packets.
+    """The state of the decoder, characters that wait for the start of a packet, and its place.
 
     `grid` is the start of the first character of a packet, us, and the number of the packet; `last` are
     packet and place of the last character, `end_us` its end; `pauses`: the stated pause was seen.
@@ -155,8 +154,7 @@ class _PacketFramer:
     def _assign_packets(
         self, state: _State, found: list[Character], is_last: bool = False
     ) -> tuple[_State, list[DecodedFrame]]:
-        """Number characters by packet and place, from the first known start on; one off the grid starts a
-        packet.
+        """Number characters by packet and place; one off the grid starts a packet.
 
         So does one after a whole packet, until the stated pause was seen: the real one may be longer.
         """

@@ -179,9 +179,9 @@ class CharacterReader:
             stretch, light, starts, self.estimate_contexts(light, starts, evidence)
         )
         light = light.learn(windows, contexts, memory, rate)
-        apart = np.diff(starts) - self.length * light.rate
-        late = apart[(np.abs(apart) > NEAR + 1) & (apart < 2 * self.length)]
-        paused = len(late), float(late.sum()), len(apart)
+        gaps = np.diff(starts) - self.length * light.rate
+        late = gaps[(np.abs(gaps) > NEAR + 1) & (gaps < 2 * self.length)]
+        paused = len(late), float(late.sum()), len(gaps)
         sums = [memory * old + new for old, new in zip(light.paused, paused, strict=True)]
         return replace(light, paused=(sums[0], sums[1], sums[2]))
 
@@ -209,12 +209,12 @@ class CharacterReader:
 
     def _estimate_rate(self, light: Light, starts: Ticks, evidence: Floats, memory: float) -> float:
         weight = memory * light.learned_bits
-        apart = np.diff(starts)
-        at_once = np.abs(apart - self.length * light.rate) <= NEAR + 1
+        gaps = np.diff(starts)
+        at_once = np.abs(gaps - self.length * light.rate) <= NEAR + 1
         if (many := int(at_once.sum())) >= _LEAST_SPACINGS:
             # Their spacing shows the clock better than their edges do.
             runs = np.cumsum(~at_once)[at_once]
-            spacings, ticks = np.bincount(runs), np.bincount(runs, apart[at_once])
+            spacings, ticks = np.bincount(runs), np.bincount(runs, gaps[at_once])
             rate = float(spacings @ ticks / (spacings @ spacings * self.length))
             gain = 4 * many / (4 * many + weight / 12)
         else:

@@ -93,10 +93,8 @@ def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_a
     """Its lower quarter is hidden, for a while or all the time; one pixel in four above it blinks, too."""
     hidden = (BAR_EVENTS.y >= 392) & (BAR_EVENTS.t_us < (30_000 if shows_again else 60_000))
     leaf = BAR_EVENTS[(BAR_EVENTS.x == 399) & (BAR_EVENTS.y < 306) & (BAR_EVENTS.t_us >= 15_000)]
-    regions = follower()
-    for start, found in step_regions(
-        regions, merge_events(BAR_EVENTS[~hidden], raise_events(leaf, 9)), 60_000
-    ):
+    regions, events = follower(), merge_events(BAR_EVENTS[~hidden], raise_events(leaf, 9))
+    for start, found in step_regions(regions, events, 60_000):
         if start == 12_000:
             (region,) = found
             regions.correct_region(region, BarPlace(region.latest.t_us, CENTRE, SIZE, (-64.0, 32.0)))
