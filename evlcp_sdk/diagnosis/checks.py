@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from evlcp_sdk.diagnosis import frame_checks, light_checks, position_checks
+from evlcp_sdk.diagnosis import frame_checks as frames, light_checks as light, position_checks as positions
 from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, Findings
 
 _Subjects = Iterator[tuple[tuple[Any, ...], dict[str, Any]]]
@@ -37,7 +37,7 @@ def _select_transmitters(facts: Facts, own_frames: int = -1) -> _Subjects:
 
 
 def _select_frequent(facts: Facts) -> _Subjects:
-    yield from _select_transmitters(facts, frame_checks.FEW_FRAMES)
+    yield from _select_transmitters(facts, frames.FEW_FRAMES)
 
 
 def _select_positions(facts: Facts) -> _Subjects:
@@ -50,68 +50,54 @@ CHECKS: tuple[tuple[str, Callable[[Facts], _Subjects], tuple[Callable[..., Findi
     (
         "events",
         _select_recording,
-        (
-            light_checks.check_events,
-            light_checks.check_times,
-            light_checks.check_room,
-            light_checks.check_links,
-        ),
+        (light.check_events, light.check_times, light.check_room, light.check_links),
     ),
-    ("readout", _select_recording, (light_checks.check_readout,)),
-    ("light", _select_recording, (light_checks.check_light,)),
-    ("polarity", _select_links, (light_checks.check_edges,)),
-    ("pixels", _select_bar, (light_checks.check_pixels,)),
-    ("size", _select_bar, (light_checks.check_size,)),
-    ("focus", _select_bar, (light_checks.check_focus,)),
-    ("brightness", _select_bar, (light_checks.check_brightness,)),
-    ("chip rate", _select_bar, (light_checks.check_rate,)),
-    ("preamble", _select_recording, (light_checks.check_preamble,)),
+    ("readout", _select_recording, (light.check_readout,)),
+    ("light", _select_recording, (light.check_light,)),
+    ("polarity", _select_links, (light.check_edges,)),
+    ("pixels", _select_bar, (light.check_pixels,)),
+    ("size", _select_bar, (light.check_size,)),
+    ("focus", _select_bar, (light.check_focus,)),
+    ("brightness", _select_bar, (light.check_brightness,)),
+    ("chip rate", _select_bar, (light.check_rate,)),
+    ("preamble", _select_recording, (light.check_preamble,)),
     (
         "frames",
         _select_links,
         (
-            frame_checks.check_frames,
-            frame_checks.check_frame_kinds,
-            frame_checks.check_flooded_frames,
-            frame_checks.check_same_symbols,
+            frames.check_frames,
+            frames.check_frame_kinds,
+            frames.check_flooded_frames,
+            frames.check_same_symbols,
         ),
     ),
     (
         "frames",
         _select_transmitters,
-        (frame_checks.check_reflection, frame_checks.check_restart, frame_checks.check_light_span),
+        (frames.check_reflection, frames.check_restart, frames.check_light_span),
     ),
-    ("frames", _select_frequent, (frame_checks.check_clock, frame_checks.check_hidden_clusters)),
-    ("frames", _select_recording, (light_checks.check_coverage,)),
-    ("orientation", _select_transmitters, (frame_checks.check_orientation,)),
+    ("frames", _select_frequent, (frames.check_clock, frames.check_hidden_clusters)),
+    ("frames", _select_recording, (light.check_coverage,)),
+    ("orientation", _select_transmitters, (frames.check_orientation,)),
     (
         "codewords",
         _select_frequent,
-        (
-            frame_checks.check_codewords,
-            frame_checks.check_symbols,
-            frame_checks.check_bit_order,
-            frame_checks.check_characters,
-        ),
+        (frames.check_codewords, frames.check_symbols, frames.check_bit_order, frames.check_characters),
     ),
-    (
-        "distances",
-        _select_frequent,
-        (frame_checks.check_distances, frame_checks.check_distortion, frame_checks.check_size),
-    ),
-    ("distances", _select_transmitters, (frame_checks.check_length,)),
-    ("messages", _select_links, (frame_checks.check_messages,)),
-    ("messages", _select_transmitters, (frame_checks.check_packets,)),
+    ("distances", _select_frequent, (frames.check_distances, frames.check_distortion, frames.check_size)),
+    ("distances", _select_transmitters, (frames.check_length,)),
+    ("messages", _select_links, (frames.check_messages,)),
+    ("messages", _select_transmitters, (frames.check_packets,)),
     (
         "positions",
         _select_positions,
         (
-            position_checks.check_sigmas,
-            position_checks.check_exclusions,
-            position_checks.check_biases,
-            position_checks.check_inputs,
-            position_checks.check_sites,
-            position_checks.check_misfits,
+            positions.check_sigmas,
+            positions.check_exclusions,
+            positions.check_biases,
+            positions.check_inputs,
+            positions.check_sites,
+            positions.check_misfits,
         ),
     ),
 )

@@ -145,7 +145,7 @@ def diagnose(
     is_wrong = any(one.verdict == "fail" or one.code in ("codewords", "unsure") for one in checks)
     if is_wrong and not facts.touches_edge:
         sample = recording.sample
-        trials = tuple(_try_links(recording, sample, sources, link, registry))
+        trials = tuple(recording.try_links(sample, sources, registry))
         start = _cut_trial_events(sample)
         inverted = Events(start.t_us, start.x, start.y, 1 - start.p)
         fits_inverted = not any(one.fits for one in trials) and try_link(link, inverted).fits
@@ -180,28 +180,8 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
         if recording.has_regions and recording.is_full:
             break
     sources, _ = recording.survey.find_sources()
-    trials = _try_links(recording, recording.sample, sources, link, registry)
+    trials = recording.try_links(recording.sample, sources, registry)
     return sorted(trials, key=lambda one: one.rank, reverse=True)
-
-
-def _try_links(
-    recording: "_RecordingPass",
-    sample: Events,
-    sources: Sequence[LightSource],
-    link: Link,
-    registry: Registry,
-) -> Iterator[Trial]:
-    start, fits = _cut_trial_events(sample), False
-    # Changes are tried only of links whose packets have a preamble.
-    if "preambles" in recording.receiver.counts and sources:
-        for trial in try_changes(link, start, registry, _candidate_rates_hz(sources, link)):
-            yield trial
-            fits |= trial.fits
-    else:
-        yield try_link(link, start)
-    if len(sample) and not fits:
-        lights = [sample[mask_inside(sample, one.box_px)] for one in sources[:_MAX_LIGHTS]]
-        yield from infer_links(link, lights or [sample], registry)
 
 
 def _cut_trial_events(sample: Events) -> Events:
@@ -218,6 +198,7 @@ class _RecordingPass:
     """
 
     def __init__(self, link: Link) -> None:
+        self.link = link
         self.survey = LightSurvey(link.camera.width, link.camera.height)
         self.receiver = Receiver(link)
         self.tally = RunTally(link.packet)
@@ -248,6 +229,22 @@ class _RecordingPass:
     def sample(self) -> Events:
         """The events for trials of other links."""
         return Events.concat(self.pieces)[:MAX_EVENTS]
+
+    def try_links(
+        self, sample: Events, sources: Sequence[LightSource], registry: Registry
+    ) -> Iterator[Trial]:
+        """Try links on a sample of it, the expected one first."""
+        start, fits = _cut_trial_events(sample), False
+        # Changes are tried only of links whose packets have a preamble.
+        if "preambles" in self.receiver.counts and sources:
+            for trial in try_changes(self.link, start, registry, _candidate_rates_hz(sources, self.link)):
+                yield trial
+                fits |= trial.fits
+        else:
+            yield try_link(self.link, start)
+        if len(sample) and not fits:
+            lights = [sample[mask_inside(sample, one.box_px)] for one in sources[:_MAX_LIGHTS]]
+            yield from infer_links(self.link, lights or [sample], registry)
 
 
 def _candidate_rates_hz(sources: Sequence[LightSource], link: Link) -> list[float]:
