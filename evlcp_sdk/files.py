@@ -89,8 +89,7 @@ class Outputs:
                 self._direct.append(target)
                 return target
             if target.parent not in self._stages:
-                stage = tempfile.mkdtemp(prefix=STAGE_PREFIX, dir=target.parent)
-                self._stages[target.parent] = Path(stage)
+                self._stages[target.parent] = Path(tempfile.mkdtemp(prefix=STAGE_PREFIX, dir=target.parent))
         self._staged[target] = self._stages[target.parent] / target.name
         return self._staged[target]
 

@@ -189,8 +189,7 @@ class Reception(Iterator[Packet]):
         Raises:
             ConfigError: pandas is not installed.
         """
-        frame: pandas.DataFrame = frames_table(self, "pandas")
-        return frame
+        return frames_table(self, "pandas")
 
     def to_arrow(self) -> pyarrow.Table:
         """The same as an Arrow table.

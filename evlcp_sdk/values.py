@@ -99,8 +99,7 @@ class Events:
             ConfigError: pandas is not installed.
         """
         columns = {name: getattr(self, name).copy() for name, _ in _COLUMNS}
-        frame: pandas.DataFrame = import_extra("pandas", "pandas").DataFrame(columns)
-        return frame
+        return import_extra("pandas", "pandas").DataFrame(columns)
 
     def to_arrow(self) -> "pyarrow.Table":
         """The events as an Arrow table with the columns t_us, x, y, p.

@@ -189,8 +189,7 @@ def _describe_messages(counts: Mapping[str, int]) -> str:
     """The number of messages, and what was lost, in one line; empty where no packet has a block."""
     if not counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0):
         return ""
-    number = counts["messages"]
-    text = format_count(number, "message")
+    text = format_count(counts["messages"], "message")
     trusts = {t: counts[f"beacons_{t}"] for t in ("verified", "unverified", "forged")}
     if beacons := [f"{'once' if n == 1 else f'{n} times'} {t}" for t, n in trusts.items() if n]:
         text += f"; beacons {', '.join(beacons)}"

@@ -44,8 +44,7 @@ def _format_table(table: dict[str, Any]) -> str:
     else:
         span = f"from {table['first_us']:,} to {table['last_us']:,} us"
         rows["time"] = [f"{table['duration_s']:.6f} s, {span}"]
-        share = f"{table['positive_share']:.0%} positive"
-        rows["events"] = [f"{table['counts']['events']:,}, {share}"]
+        rows["events"] = [f"{table['counts']['events']:,}, {table['positive_share']:.0%} positive"]
         mean = "-" if table["events_per_s"] is None else f"{table['events_per_s'] / 1e6:.3f}"
         peak = f"{table['peak_events_per_s'] / 1e6:.3f}"
         rows["rate"] = [f"{mean} Mev/s, at most {peak} Mev/s over {RATE_WINDOW_US / 1e3:.0f} ms"]

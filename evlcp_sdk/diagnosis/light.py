@@ -235,8 +235,7 @@ class LightSurvey:
         rows, columns = np.nonzero(rises >= _MIN_RISES)
         for start in range(0, len(rows), _CELLS_AT_ONCE):
             part = slice(start, start + _CELLS_AT_ONCE)
-            times = self._intervals[rows[part], columns[part]].astype(np.float64)
-            mean = _significant_means(times)
+            mean = _significant_means(self._intervals[rows[part], columns[part]])
             best = mean.max(-1)
             lowest = (mean >= _NEAR_MAXIMUM * best[:, None]).argmax(-1)
             frequency[rows[part], columns[part]] = FREQUENCIES_HZ[lowest]

@@ -81,8 +81,7 @@ class PictureSlot:
         if not self._requested:
             return
         self._requested = False
-        pieces = tuple(self._recent)
-        picture = Picture(end_us, pieces, width, height, tuple(regions), self._number)
+        picture = Picture(end_us, tuple(self._recent), width, height, tuple(regions), self._number)
         self._number += 1
         with self._drawn:
             self._picture = picture

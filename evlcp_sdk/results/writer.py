@@ -190,8 +190,7 @@ class ResultWriter:
         }
         if len(parts) == 1:
             return next(iter(parts.values()))
-        reads = any(one.reads_messages for one in parts.values())
-        return replace(facts, reads_messages=reads, parts=parts)
+        return replace(facts, reads_messages=any(p.reads_messages for p in parts.values()), parts=parts)
 
     def _write_fixes(self, fixes: Iterable[Placed]) -> None:
         for placed in fixes:
