@@ -51,7 +51,7 @@ class PictureSlot:
         self._picture: Picture | None = None
         self._drawn = threading.Condition()
         self._number = 0
-        self._over = False
+        self._closed = False
 
     def request(self) -> None:
         """Request a picture, drawn with the next slice."""
@@ -62,7 +62,7 @@ class PictureSlot:
         with self._drawn:
             self._picture = None
             self._requested = True
-            self._drawn.wait_for(lambda: self._picture is not None or self._over, timeout_s)
+            self._drawn.wait_for(lambda: self._picture is not None or self._closed, timeout_s)
             return self._picture
 
     @property
@@ -90,6 +90,6 @@ class PictureSlot:
     def close(self) -> None:
         """End the drawing."""
         with self._drawn:
-            self._over = True
+            self._closed = True
             self._recent.clear()
             self._drawn.notify_all()

@@ -41,12 +41,12 @@ class Subscription:
         self._wake = wake
         self._queue: deque[News] = deque()
         self._filled = threading.Condition()
-        self._over = False
+        self._closed = False
 
     @property
     def ended(self) -> bool:
         """Whether nothing more will come, and nothing is left."""
-        return self._over and not self._queue
+        return self._closed and not self._queue
 
     def take(self, timeout_s: float | None = None) -> list[News]:
         """Remove and return all news, oldest first.
@@ -54,15 +54,15 @@ class Subscription:
         Waits `timeout_s` for some, 0 not at all, None until something comes or the subscription ends.
         """
         with self._filled:
-            if not self._queue and not self._over and timeout_s != 0:
-                self._filled.wait_for(lambda: self._queue or self._over, timeout_s)
+            if not self._queue and not self._closed and timeout_s != 0:
+                self._filled.wait_for(lambda: self._queue or self._closed, timeout_s)
             taken, self._queue = list(self._queue), deque()
         return taken
 
     def put(self, news: News) -> None:
         """Add news; a full queue drops the oldest."""
         with self._filled:
-            if self._over:
+            if self._closed:
                 return
             if len(self._queue) == self._most:
                 self._queue.popleft()
@@ -75,7 +75,7 @@ class Subscription:
     def close(self) -> None:
         """End the queue; what is in it can still be taken."""
         with self._filled:
-            self._over = True
+            self._closed = True
             self._filled.notify_all()
         if self._wake is not None:
             self._wake()
@@ -97,7 +97,7 @@ class Publisher:
 
     def __init__(self) -> None:
         self.pictures = PictureSlot()
-        self._all: tuple[Subscription, ...] = ()
+        self._subscriptions: tuple[Subscription, ...] = ()
         self._lock = threading.Lock()
         self._closed = False
 
@@ -123,22 +123,22 @@ class Publisher:
             if self._closed:
                 subscription.close()
             else:
-                self._all = (*self._all, subscription)
+                self._subscriptions = (*self._subscriptions, subscription)
         return subscription
 
     def unsubscribe(self, subscription: Subscription) -> None:
         """End a subscription; twice does no harm."""
         with self._lock:
-            self._all = tuple(one for one in self._all if one is not subscription)
+            self._subscriptions = tuple(one for one in self._subscriptions if one is not subscription)
         subscription.close()
 
     def has_listeners(self, kind: str) -> bool:
         """Whether there are subscriptions to a kind."""
-        return any(kind in one.kinds for one in self._all)
+        return any(kind in one.kinds for one in self._subscriptions)
 
     def publish(self, kind: str, t_us: float, value: Any, late_ms: float | None = None) -> None:
         """Pass a result to all subscriptions to its kind."""
-        listeners = [one for one in self._all if kind in one.kinds]
+        listeners = [one for one in self._subscriptions if kind in one.kinds]
         if not listeners:
             return
         news = News(kind, t_us, value, late_ms)
@@ -149,7 +149,7 @@ class Publisher:
         """End all subscriptions and pictures; waiting news can still be taken."""
         with self._lock:
             self._closed = True
-            subscriptions, self._all = self._all, ()
+            subscriptions, self._subscriptions = self._subscriptions, ()
         for one in subscriptions:
             one.close()
         self.pictures.close()

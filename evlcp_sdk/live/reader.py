@@ -71,7 +71,7 @@ class Reader:
         self._waiting: deque[Slice] = deque()
         self._events = 0
         self._changed = threading.Condition()
-        self._over = self._left = False
+        self._finished = self._stopped = False
         self.arrivals = ArrivalClock()
         self.dropped = 0
         self.fault: BaseException | None = None
@@ -84,13 +84,13 @@ class Reader:
     @property
     def ended(self) -> bool:
         """Whether nothing more will come, and nothing waits."""
-        return self._over and not self._waiting
+        return self._finished and not self._waiting
 
     def take(self, timeout_s: float) -> Slice | None:
         """Remove and return the next slice; None after the time-out, or at the end."""
         with self._changed:
             if (
-                not self._changed.wait_for(lambda: self._waiting or self._over, timeout_s)
+                not self._changed.wait_for(lambda: self._waiting or self._finished, timeout_s)
                 or not self._waiting
             ):
                 return None
@@ -103,7 +103,7 @@ class Reader:
     def stop(self) -> None:
         """Stop reading; the thread of a source that waits for a camera may go on."""
         with self._changed:
-            self._left = True
+            self._stopped = True
             self._changed.notify_all()
         self._thread.join(1.0)
 
@@ -115,7 +115,7 @@ class Reader:
         except BaseException as fault:
             self.fault = fault
         with self._changed:
-            self._over = True
+            self._finished = True
             self._changed.notify_all()
 
     def _enqueue(self, piece: Slice) -> bool:
@@ -123,7 +123,7 @@ class Reader:
             self.arrivals.add_arrival(float(piece.events.t_us[-1]), piece.arrived_s)
         with self._changed:
             if not self._source.live:
-                self._changed.wait_for(lambda: self._events < _MAX_EVENTS or self._left)
+                self._changed.wait_for(lambda: self._events < _MAX_EVENTS or self._stopped)
             self._waiting.append(piece)
             self._events += len(piece.events)
             while self._source.live and self._events > _MAX_EVENTS and len(self._waiting) > 1:
@@ -131,4 +131,4 @@ class Reader:
                 self._events -= len(old.events)
                 self.dropped += len(old.events)
             self._changed.notify_all()
-            return not self._left
+            return not self._stopped

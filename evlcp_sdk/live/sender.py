@@ -49,7 +49,7 @@ class Sender:
         self._threads: list[threading.Thread] = []
         self._listening: list[socket.socket] = []
         self._connected = threading.Event()
-        self._over = threading.Event()
+        self._closing = threading.Event()
         self._unix = unix
         self.port = 0
         self.counts = {"events": 0, "listeners": 0, "pieces_dropped": 0}
@@ -92,13 +92,13 @@ class Sender:
                     break
         finally:
             self._publisher.close()
-            self._over.set()
+            self._closing.set()
             for thread in self._threads:
                 thread.join(2 * _STALLED_S)
 
     def close(self) -> None:
         """Disconnect all clients."""
-        self._over.set()
+        self._closing.set()
         self._publisher.close()
         for one in self._listening:
             one.close()
@@ -118,7 +118,7 @@ class Sender:
         thread.start()
 
     def _accept(self, listening: socket.socket) -> None:
-        while not self._over.is_set():
+        while not self._closing.is_set():
             try:
                 connection, _ = listening.accept()
             except TimeoutError:
