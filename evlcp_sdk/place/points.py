@@ -83,14 +83,12 @@ def interpolate_points(
 
     The shape is a straight line in time through all frames within half a period; the place is interpolated
     between the frames next to the time. Sigmas along the bar are those that the frames state, or larger where
-    length and curvature scatter more from frame to frame, as with a late readout; the error within pixels is
-    added as far as the image has not moved on. Across the bar they are the larger of the scatter of tilt and
-    curvature and of the points' deviation from the layout: errors that all frames share do not scatter.
-    Errors that all points share are separate: the unseen place of a thin bar within a pixel, and the timing
-    of a moving image.
+    length and curvature scatter more, as with a late readout; the error within pixels is added as far as the
+    image has not moved on. Across the bar they are the larger of the scatter of tilt and curvature and of the
+    deviation from the layout, as errors that all frames share do not scatter. Errors that all points share
+    are separate: the place of a thin bar within a pixel, and the timing of a moving image.
 
-    `frames` are in order of time; those within half of `period_us` before and after count. `layout_m` has the
-    clusters' places in the bar, float64 (K, 3).
+    `frames` are in order of time; `layout_m` has the clusters' places in the bar, float64 (K, 3).
 
     Returns:
         The view, still without `enu_m`; None where the bar is not seen both before and after.
