@@ -302,9 +302,8 @@ def live(
     """Receive in real time: publish results as they come, measure delays, and shed what is too much.
 
     See `evlcp_sdk.live` for how to subscribe. A recording is replayed at the pace of its clock. Arguments are
-    those of `receive_to_folder`, and three more: `publisher` takes subscriptions and draws pictures, and is
-    closed at the end; `budget` has the limits of shedding; `warm` loads all kernels before the first event,
-    and before a source that does not wait is opened.
+    those of `receive_to_folder`, and three more: `publisher` is closed at the end; `budget` limits shedding;
+    `warm` loads all kernels before the first event, and before a source that does not wait is opened.
 
     Returns:
         The summary, as of `receive_to_folder`, with `live`: delays by stage, and what was shed.
