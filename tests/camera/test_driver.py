@@ -280,7 +280,7 @@ def test_masks_leave_the_areas():
     import neuromorphic_drivers
 
     kind = neuromorphic_drivers.prophesee_evk4
-    masks = camera._masks("camera:", kind, [(10, 20, 30, 40), (100, 0, 5, 5)])
+    masks = camera._make_masks("camera:", kind, [(10, 20, 30, 40), (100, 0, 5, 5)])
     words = (np.array(masks[name], "<u8").view(np.uint8) for name in ("x_mask", "y_mask"))
     columns, rows = (np.unpackbits(one, bitorder="little") for one in words)
     columns, rows = columns[:1280], rows[:720][::-1]
