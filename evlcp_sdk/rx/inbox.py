@@ -33,7 +33,16 @@ _MOST_TRANSMITTERS = 16
 _MOST_MESSAGES = 8
 """Messages of a transmitter that are collected at a time, and complete ones that are remembered."""
 
+_COUNTS = (
+    *("blocks_reflected", "blocks_tried", "blocks_decoded", "blocks_combined", "blocks_failed"),
+    *("blocks_alike", "blocks_malformed", "blocks_other_codebook"),
+    *("parts_repeated", "parts_conflicting", "parts_missing"),
+    *("messages", "messages_mixed", "messages_undecodable"),
+    *("beacons_verified", "beacons_unverified", "beacons_forged", "beacons_undated"),
+)
+
 _Key = tuple[int, int, int]
+"""Transmitter id, kind and sequence of a message."""
 
 
 @dataclass
@@ -111,29 +120,7 @@ class MessageAssembler:
         self._beacon_verifier = BeaconVerifier(spec, coder.digest)
         self._clock_zero = clock_zero
         self._inboxes: OrderedDict[int, _Inbox] = OrderedDict()
-        self.counts = dict.fromkeys(
-            (
-                "blocks_reflected",
-                "blocks_tried",
-                "blocks_decoded",
-                "blocks_combined",
-                "blocks_failed",
-                "blocks_alike",
-                "blocks_malformed",
-                "blocks_other_codebook",
-                "parts_repeated",
-                "parts_conflicting",
-                "parts_missing",
-                "messages",
-                "messages_mixed",
-                "messages_undecodable",
-                "beacons_verified",
-                "beacons_unverified",
-                "beacons_forged",
-                "beacons_undated",
-            ),
-            0,
-        )
+        self.counts = dict.fromkeys(_COUNTS, 0)
 
     @classmethod
     def of(cls, link: Link, clock_zero: ClockZero = None) -> Self | None:
@@ -270,7 +257,8 @@ class MessageAssembler:
             value = kind.unpack(message.payload)
         except (Exception, SystemExit):
             # Whatever a lamp sends, and whatever a plugin makes of it, the receiver goes on.
-            self._count_undecodable(known)
+            self.counts["messages_undecodable"] += known.delivered is None
+            known.delivered = TrustVerdict("unverified", "undecodable")
             return []
         beacon = value if message.kind == Kind.BEACON else None
         verdict, now_s = TrustVerdict("unverified", "not signed"), None
@@ -297,12 +285,6 @@ class MessageAssembler:
         elif message.kind == Kind.TIME and now_s is not None:
             age_s = now_s - value
         return [ReceivedMessage(*where, message, kind, value, verdict.trust, reason, age_s, packet.link)]
-
-    def _count_undecodable(self, known: _PartialMessage) -> None:
-        """Count a message whose bytes mean nothing, once."""
-        if known.delivered is None:
-            known.delivered = TrustVerdict("unverified", "undecodable")
-            self.counts["messages_undecodable"] += 1
 
     def _count_missing(self, incomplete: Iterable[_PartialMessage]) -> None:
         for partial in incomplete:

@@ -79,7 +79,6 @@ class RegionTrack:
 
     Attributes:
         latest: The newest.
-        previous: The one before it; the same where there is no other.
 
     >>> track = RegionTrack([Region(0, 0.0, 5.0, 7.0, 4.0, 9.0), Region(0, 100.0, 6.0, 7.0, 4.0, 9.0)])
     >>> len(track), track.centre_at(50.0), track.centre_at(1000.0), track.size_at(70.0)
@@ -87,7 +86,7 @@ class RegionTrack:
     """
 
     def __init__(self, regions: Sequence[Region]) -> None:
-        self.previous = self.latest = regions[0]
+        self.latest = regions[0]
         self._first = self._end = 0
         self._columns = np.empty((5, _CAPACITY))
         for region in regions:
@@ -103,13 +102,19 @@ class RegionTrack:
         sample = region.t_us, region.x_px, region.y_px, region.width_px, region.height_px
         self._columns[:, self._end] = sample
         self._end += 1
-        self.previous, self.latest = self.latest, region
+        self.latest = region
+
+    @property
+    def previous(self) -> Region:
+        """The one before the newest; the same where there is no other."""
+        if len(self) == 1:
+            return self.latest
+        return make_region(self.latest.id, *self._columns[:, self._end - 2].tolist())
 
     def drop_latest(self) -> None:
         """Undo the last `append`."""
-        self._end -= 1
         self.latest = self.previous
-        self._find_previous()
+        self._end -= 1
 
     def forget_before(self, t_us: float) -> None:
         """Drop those older than a time, except the newest of them; the last two stay."""
@@ -155,7 +160,6 @@ class RegionTrack:
                 samples[2] += np.minimum(np.maximum(row_px - samples[2], -slack_px), slack_px)
             samples[3], samples[4] = size_px
         track.latest = make_region(id, *samples[:, -1].tolist())
-        track._find_previous()
         return track
 
     def centres_at(
@@ -195,12 +199,6 @@ class RegionTrack:
             i -= 1
         width_px, height_px = self._columns[3:, i].tolist()
         return width_px, height_px
-
-    def _find_previous(self) -> None:
-        if self._end - self._first > 1:
-            self.previous = make_region(self.latest.id, *self._columns[:, self._end - 2].tolist())
-        else:
-            self.previous = self.latest
 
     def _samples(self) -> NDArray[np.float64]:
         """Times, columns, rows, widths and heights, float64 (5, n)."""
@@ -537,17 +535,16 @@ class RhythmTracker(RegionTracker):
 
     def _predict_boxes(self, t_us: float, occupied: Sequence[Region]) -> list[Box]:
         """The box of each region in the middle of a step; one of unknown size is kept clear of the others."""
-        boxes, unknown, others = [], [], [box_of(place) for place in occupied]
+        boxes, others = [], [box_of(place) for place in occupied]
         for region in self.alive:
             x_px, y_px = self._predict_centre(region, t_us)
             boxes.append(self._search_box(x_px, y_px, *self._swept_size(region)))
-            if region.size_px is None:
-                unknown.append(len(boxes) - 1)
-            else:
+            if region.size_px is not None:
                 others.append(box_around(x_px, y_px, region.latest.width_px, region.latest.height_px))
-        for number in unknown:
-            boxes[number] = subtract_boxes(boxes[number], others)
-        return boxes
+        return [
+            subtract_boxes(box, others) if region.size_px is None else box
+            for region, box in zip(self.alive, boxes, strict=True)
+        ]
 
     def _swept_size(self, region: TrackedRegion) -> tuple[float, float]:
         """(width, height) that a region covers in a step, px."""
@@ -818,9 +815,8 @@ class RhythmTracker(RegionTracker):
             return region.filter, place, velocity_px_us
         centre = np.array([place.x_px, place.y_px])
         state, centre, _ = self._centre_filter.step(region.filter, t_us, centre, _CENTRE_SIGMA_PX)
-        x_px, y_px = float(centre[0]), float(centre[1])
-        place = Region(place.id, t_us, x_px, y_px, place.width_px, place.height_px)
-        return state, place, velocity_px_us
+        x_px, y_px = map(float, centre)
+        return state, make_region(place.id, t_us, x_px, y_px, place.width_px, place.height_px), velocity_px_us
 
     def _fit_sweep(self, region: TrackedRegion, box: Box, middle_us: float) -> Sweep | None:
         """Fit a sweep to a region's newest events; None where it is slow enough for its pixels to blink."""

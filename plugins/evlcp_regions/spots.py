@@ -186,14 +186,14 @@ class _SpotDetector:
     def step(self, state: _State, start_us: int, events: Events) -> tuple[_State, list[Region]]:
         now_us = float(events.t_us[-1]) if len(events) else float(start_us)
         spots: list[_Spot] = []
-        regions: list[Region] = []
+        regions: dict[int, Region] = {}
         places = self._follow_spots(state.spots, start_us, now_us, events)
         for before, (seen, x_px, y_px) in zip(state.spots, places, strict=True):
             is_double = any(_distance_px(x_px, y_px, other) < self.spec.reach_px for other in spots)
             has_faded = now_us - seen.turned_us > self.spec.fade_us
             if not (is_double or has_faded):
                 spots.append(self._assess_spot(before, seen, (x_px, y_px), places, start_us, events))
-                regions.append(self._make_region(seen, x_px, y_px, now_us))
+                regions[seen.id] = self._make_region(seen, x_px, y_px, now_us)
         cells, new = self._update_cells(state.cells, start_us, events)
         next_id = state.next_id
         for spot in new:
@@ -201,16 +201,14 @@ class _SpotDetector:
             displaced = self._find_displaced(spot, spots, is_veiled=is_veiled)
             if displaced is None:
                 continue
-            ids = {other.id for other in displaced}
-            regions = [region for region in regions if region.id not in ids]
-            spots = [other for other in spots if other.id not in ids]
+            spots = [other for other in spots if other not in displaced]
             spots.append(replace(spot, id=next_id, is_source=not is_veiled))
-            regions.append(self._make_region(spots[-1], spot.x_px, spot.y_px, now_us))
+            regions[next_id] = self._make_region(spots[-1], spot.x_px, spot.y_px, now_us)
             next_id += 1
         spots = _mark_parts(spots, now_us)
         single = [
-            region
-            for region, spot in zip(regions, spots, strict=True)
+            regions[spot.id]
+            for spot in spots
             if spot.is_source
             and now_us - spot.found_us >= _YOUNG_US
             and spot.turned_us - spot.part_us > _PART_US
