@@ -29,8 +29,8 @@ def blobs(columns, rows, until_us):
     return found[: found.t_us.searchsorted(until_us)]
 
 
-def step_follower(events, until_us, **limits):
-    """A follower with these limits after each step of a stream."""
+def step_tracker(events, until_us, **limits):
+    """A tracker with these limits after each step of a stream."""
     regions = RhythmTracker(SPEC, CameraModel(), LINK.packet.chip_us, None, KEEP_US, Limits(**limits))
     for start_us, part in steps(events, until_us):
         regions.step(start_us, part)
@@ -73,17 +73,17 @@ def test_small_pieces_of_a_step_take_the_memory_of_their_events():
 
 def test_the_whole_image_is_forgotten_sooner_where_it_takes_too_much():
     events = noise_events(6.6e6, 30_000)
-    for regions in step_follower(events, 30_000, recent_bytes=400_000):
+    for regions in step_tracker(events, 30_000, recent_bytes=400_000):
         assert bytes_of(regions._recent) <= 400_000
     assert regions.counts["steps_forgotten"] > 0
-    *_, free = step_follower(events, 30_000)
+    *_, free = step_tracker(events, 30_000)
     assert bytes_of(free._recent) > 1_000_000
     assert free.counts["steps_forgotten"] == 0
 
 
 def test_the_oldest_events_of_regions_are_forgotten():
     events = blobs(5, 4, 40_000)
-    for regions in step_follower(events, 40_000, region_bytes=150_000):
+    for regions in step_tracker(events, 40_000, region_bytes=150_000):
         held = [bytes_of(one.pieces) for one in regions.alive]
         # What came in the last step is checked at its end.
         assert sum(held) <= 150_000 + 20 * (PIECE_BYTES + 1000 * EVENT_BYTES)
@@ -92,7 +92,7 @@ def test_the_oldest_events_of_regions_are_forgotten():
     cut = [one for one in regions.alive if one.forgotten_until_us is not None]
     assert cut
     assert all(one.pieces[0][0] == one.forgotten_until_us == one.first_us for one in cut)
-    free = [(sum(bytes_of(one.pieces) for one in r.alive), r.counts) for r in step_follower(events, 40_000)]
+    free = [(sum(bytes_of(one.pieces) for one in r.alive), r.counts) for r in step_tracker(events, 40_000)]
     assert max(held for held, _ in free) > 400_000
     assert free[-1][1]["dropped_no_room"] == 0
 
@@ -100,14 +100,14 @@ def test_the_oldest_events_of_regions_are_forgotten():
 def test_a_region_that_had_its_time_gives_way():
     events = blobs(6, 3, 60_000)
     seen = set()
-    for regions in step_follower(events, 60_000, regions=7):
+    for regions in step_tracker(events, 60_000, regions=7):
         assert len(regions.alive) <= 7
         seen |= {one.id for one in regions.alive}
     assert regions.counts["regions_gave_way"] > 0
     assert regions.counts["regions_left_out"] > 0
     # Every blob had its turn.
     assert len(seen) >= 18
-    *_, free = step_follower(events, 60_000)
+    *_, free = step_tracker(events, 60_000)
     assert len(free.alive) == 18
 
 

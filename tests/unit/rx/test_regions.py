@@ -23,7 +23,7 @@ BAR, BAR_EVENTS = lit(2, start_us=0)
 CENTRE, SIZE = (BAR.x_px - 0.5, BAR.y_px - 0.5), (4.0, 128.0)
 
 
-def follower(spec=SPEC, **options):
+def make_tracker(spec=SPEC, **options):
     return RhythmTracker(spec, CameraModel(), LINK.packet.chip_us, **options)
 
 
@@ -33,7 +33,7 @@ def step_regions(regions, events, until_us):
 
 
 def follow(events, until_us, spec=SPEC):
-    return dict(step_regions(follower(spec), events, until_us))
+    return dict(step_regions(make_tracker(spec), events, until_us))
 
 
 def raise_events(events, by_px):
@@ -76,7 +76,7 @@ def test_a_shaking_bar_is_followed(shake_px, shake_hz):
 def test_a_bar_that_leaves_the_image_fast_is_let_go(way):
     """The filter's prediction runs on off the sensor until the region is released."""
     kalman = load_link(overrides=["tracking.id=kalman"]).algorithm("tracking").compile()
-    regions = follower(centre_filter=kalman.position)
+    regions = make_tracker(centre_filter=kalman.position)
     moved_px = np.rint(9e-3 * np.maximum(BAR_EVENTS.t_us - 15_000, 0)).astype(np.int64)
     x = BAR_EVENTS.x + way[0] * moved_px + {1: 800, 0: 0, -1: -350}[way[0]]
     y = BAR_EVENTS.y + way[1] * moved_px
@@ -93,7 +93,7 @@ def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_a
     """Its lower quarter is hidden, for a while or all the time; one pixel in four above it blinks, too."""
     hidden = (BAR_EVENTS.y >= 392) & (BAR_EVENTS.t_us < (30_000 if shows_again else 60_000))
     leaf = BAR_EVENTS[(BAR_EVENTS.x == 399) & (BAR_EVENTS.y < 306) & (BAR_EVENTS.t_us >= 15_000)]
-    regions, events = follower(), merge_events(BAR_EVENTS[~hidden], raise_events(leaf, 9))
+    regions, events = make_tracker(), merge_events(BAR_EVENTS[~hidden], raise_events(leaf, 9))
     for start, found in step_regions(regions, events, 60_000):
         if start == 12_000:
             (region,) = found
@@ -111,7 +111,7 @@ def test_bars_farther_apart_than_the_gap_are_two_regions_for_every_gap(merge_px)
 
 def test_what_fades_is_released():
     ends = 34_600
-    seen = step_regions(follower(), BAR_EVENTS[BAR_EVENTS.t_us < ends], ends + SPEC.fade_us + 5000)
+    seen = step_regions(make_tracker(), BAR_EVENTS[BAR_EVENTS.t_us < ends], ends + SPEC.fade_us + 5000)
     alive = {start: [not one.released for one in found] for start, found in seen}
     (gone,) = [start for start, found in alive.items() if found == [False]]
     assert gone == pytest.approx(ends + SPEC.fade_us, abs=2 * STEP_US)
@@ -174,7 +174,7 @@ def in_rhythm(events, until_us):
 def test_a_region_takes_its_bars_size_and_gathers_its_events():
     """Only the upper half is lit at first; the events of the whole come back from the image's."""
     kept = BAR_EVENTS[(BAR_EVENTS.y < 345) | (BAR_EVENTS.t_us >= 20_000)]
-    regions = follower(keep_us=50_000)
+    regions = make_tracker(keep_us=50_000)
     *_, (_, (region, *_)) = step_regions(regions, kept, 25_000)
     before = sum(len(e) for _, e in region.pieces)
     assert regions.correct_region(region, BarPlace(24_000.0, CENTRE, SIZE)) == np.inf
@@ -194,7 +194,7 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events():
 def test_a_region_does_not_go_on_to_the_bar_below():
     """Four dark rows are between them, and the region seems to move there by 7 px a step."""
     below = CENTRE[0], CENTRE[1] + 132
-    regions = follower()
+    regions = make_tracker()
     events = merge_events(BAR_EVENTS, ideal_events(LINK, replace(BAR, y_px=BAR.y_px + 132), seed=2))
     for start, found in step_regions(regions, events, 40_000):
         if start == 10_000:
@@ -245,7 +245,7 @@ def test_the_part_of_a_box_that_is_clear_of_others(others, clear):
 
 
 def test_of_two_regions_that_follow_the_same_the_older_stays():
-    regions = follower()
+    regions = make_tracker()
     for start, found in step_regions(regions, BAR_EVENTS, 15_000):
         if start == 10_000:
             (first,) = found
