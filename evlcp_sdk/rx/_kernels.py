@@ -52,12 +52,12 @@ def score_rises(
     shifts: tuple[int, int],
     aging: tuple[int, int, int, int, int],
 ) -> int:
-    """Score each pixel by the rhythm of its rises; count those of candidates in their cell's `hits`.
+    """Score each pixel by the rhythm of its rises; count those of candidates, by cell in `hits`.
 
     Args:
         events: Those of a step, in order.
-        pixels: States of the pixels, uint32 (height, width), see `BlinkDetector`.
-        hits: Takes the hits by cell, int16 (rows, columns).
+        pixels: States, uint32 (height, width), see `BlinkDetector`.
+        hits: By cell, int16 (rows, columns).
         kinds: Kind of a time by its ticks, the last, 0, for all beyond.
         transitions: New time and score of a pixel, and in the bits above whether its time came again.
         limits: (ticks below which a rise is the same as the one before; the least score of a hit; repetitions
@@ -65,9 +65,6 @@ def score_rises(
         shifts: A tick is 2^first us, a cell 2^second px wide.
         aging: What is old grows no older: (first row; number of rows from there on, cyclic; ticks now; ticks
             after which a rise is old; its age then).
-
-    Returns:
-        Number of hits.
     """
     first_row, row_count, now, old_ticks, age = aging
     then = np.uint32((np.uint32(now) - np.uint32(age)) << _CLOCK_SHIFT)
@@ -150,13 +147,8 @@ def measure_box(
     leaves. Those that hold most within twice `reach` give the mean column; rows count their pixels within
     `reach` of it. An edge row that holds fewer pixels than a full one counts by its share.
 
-    Args:
-        pixels: States, uint32 (height, width).
-        box: (left, top, right, bottom).
-        awake: (ticks now; ticks since which a pixel must have risen; its least score).
-        seam: Columns at either side of the box.
-        reach: Half the width of the bar, px; infinite if it is not known.
-        rows: Takes the pixels by row.
+    `awake` are (ticks now; ticks within which a pixel must have risen; its least score), `rows` takes the
+    pixels by row.
 
     Returns:
         (pixels, mean column, first column, last column, upper edge, lower edge, share of the pixels
