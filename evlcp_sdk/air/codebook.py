@@ -55,6 +55,26 @@ def hadamard(order: int) -> Values:
     return matrix
 
 
+def signed_hadamard(order: int) -> Values:
+    """Rows of a Hadamard matrix, then the same rows inverted, int8 (2 * order, order)."""
+    rows = hadamard(order)
+    return np.concatenate([rows, -rows])
+
+
+def pilot_values(clusters: int) -> Values:
+    """Pilots of air interface 1, int8 (clusters, N): N = 8 for up to 16 clusters, then 16, 32, ..."""
+    order = 8
+    while 2 * order < clusters:
+        order *= 2
+    return signed_hadamard(order)[:clusters]
+
+
+def wh4x2_values() -> Values:
+    """Codewords of two words of H_4, 3 bits (sign, row) each, int8 (64, 8)."""
+    words = signed_hadamard(4)
+    return np.concatenate([np.repeat(words, 8, axis=0), np.tile(words, (8, 1))], axis=1)
+
+
 def chips_of_values(values: ArrayLike) -> Chips:
     """Chips (1 = LED on) of bipolar values along the last axis: b becomes the pair (-b, +b).
 

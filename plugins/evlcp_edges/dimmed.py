@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from evlcp_sdk.air.codebook import BARKER13, hadamard
+from evlcp_sdk.air.codebook import BARKER13, pilot_values, wh4x2_values
 from evlcp_sdk.plugin.roles import Modulation, Pilots
 
 Slots = Annotated[
@@ -53,11 +53,7 @@ class DimmedPilots(Pilots):
 
     def codes(self, clusters: int) -> NDArray[np.uint8]:
         """uint8 (clusters, N), N = 8 * slots for up to 16 clusters."""
-        order = 8
-        while 2 * order < clusters:
-            order *= 2
-        rows = hadamard(order)
-        return pulse_chips(np.concatenate([rows, -rows])[:clusters], self.slots)
+        return pulse_chips(pilot_values(clusters), self.slots)
 
 
 @dataclass(frozen=True)
@@ -68,8 +64,4 @@ class DimmedWh4x2(Modulation):
 
     def codewords(self) -> NDArray[np.uint8]:
         """uint8 (64, 8 * slots)."""
-        rows = hadamard(4)
-        words = np.concatenate([rows, -rows])
-        return pulse_chips(
-            np.concatenate([np.repeat(words, 8, axis=0), np.tile(words, (8, 1))], axis=1), self.slots
-        )
+        return pulse_chips(wh4x2_values(), self.slots)

@@ -5,13 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import chips_of_values, hadamard
+from evlcp_sdk.air.codebook import chips_of_values, signed_hadamard, wh4x2_values
 from evlcp_sdk.plugin.roles import Modulation
-
-
-def _hadamard_words(order: int) -> NDArray[np.int8]:
-    rows = hadamard(order)
-    return np.concatenate([rows, -rows])
 
 
 @dataclass(frozen=True)
@@ -24,8 +19,7 @@ class Wh4x2(Modulation):
 
     def codewords(self) -> NDArray[np.uint8]:
         """uint8 (64, 16)."""
-        words = _hadamard_words(4)
-        return chips_of_values(np.concatenate([np.repeat(words, 8, axis=0), np.tile(words, (8, 1))], axis=1))
+        return chips_of_values(wh4x2_values())
 
 
 @dataclass(frozen=True)
@@ -34,7 +28,7 @@ class Wh8(Modulation):
 
     def codewords(self) -> NDArray[np.uint8]:
         """uint8 (16, 16)."""
-        return chips_of_values(_hadamard_words(8))
+        return chips_of_values(signed_hadamard(8))
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import BARKER13, chips_of_values, hadamard
+from evlcp_sdk.air.codebook import BARKER13, chips_of_values, pilot_values
 from evlcp_sdk.plugin.roles import Pilots
 
 
@@ -25,8 +25,4 @@ class WhPilots(Pilots):
 
     def codes(self, clusters: int) -> NDArray[np.uint8]:
         """uint8 (clusters, N), N = 16 for up to 16 clusters."""
-        order = 8
-        while 2 * order < clusters:
-            order *= 2
-        rows = hadamard(order)
-        return chips_of_values(np.concatenate([rows, -rows])[:clusters])
+        return chips_of_values(pilot_values(clusters))
