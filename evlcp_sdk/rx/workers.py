@@ -74,20 +74,17 @@ class Workers:
                 or an algorithm cannot be sent to them.
             WorkerError: One does not start.
         """
-        if processes < 1 or (processes > 1 and has_announcer):
-            reason = (
-                ", as a sink or plugin follows the stages" if has_announcer and processes > 0 else " or more"
-            )
-            raise ConfigError(f"workers: {processes}, expected 1{reason}")
+        if processes < 1:
+            raise ConfigError(f"workers: {processes}, expected 1 or more")
+        if processes > 1 and has_announcer:
+            raise ConfigError(f"workers: {processes}, expected 1, as a sink or plugin follows the stages")
         shared = {name: link for name, link in links.items() if has_bar_frames(link)}
         return cls(shared, processes - 1) if processes > 1 and shared else None
 
     def bar_decoders(self, link: str) -> list["_WorkerBarDecoder"]:
         """A decoder in each worker for the bars of a link; none where that has no bars."""
-        shared = self._links.get(link)
-        if shared is None:
-            return []
-        return [_WorkerBarDecoder(worker, link, shared.regions.step_us) for worker in self._workers]
+        workers = self._workers if link in self._links else []
+        return [_WorkerBarDecoder(worker, link, self._links[link].regions.step_us) for worker in workers]
 
     def close(self) -> None:
         """End the processes."""
@@ -248,8 +245,8 @@ class _WorkerBarDecoder:
         pieces = region.pieces_between(due.start_us, due.read_us, self._step_us)
         places, memory = self._worker.copy_events(pieces)
         bare = TrackedRegion(region.id, region.track, region.first_us, size_px=region.size_px)
-        job = job._replace(region=bare)
-        return self._worker.request("decode", self._link, bar, (job, places), memory=memory)
+        content = job._replace(region=bare), places
+        return self._worker.request("decode", self._link, bar, content, memory=memory)
 
 
 def _make_poller(pipe: Connection) -> select.poll:

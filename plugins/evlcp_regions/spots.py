@@ -190,8 +190,7 @@ class _SpotDetector:
         places = self._follow_spots(state.spots, start_us, now_us, events)
         for before, (seen, x_px, y_px) in zip(state.spots, places, strict=True):
             is_double = any(_distance_px(x_px, y_px, other) < self.spec.reach_px for other in spots)
-            has_faded = now_us - seen.turned_us > self.spec.fade_us
-            if not (is_double or has_faded):
+            if not is_double and now_us - seen.turned_us <= self.spec.fade_us:
                 spots.append(self._assess_spot(before, seen, (x_px, y_px), places, start_us, events))
                 regions[seen.id] = self._make_region(seen, x_px, y_px, now_us)
         cells, new = self._update_cells(state.cells, start_us, events)
@@ -223,9 +222,9 @@ class _SpotDetector:
         is_known = any(_distance_px(spot.x_px, spot.y_px, other) < self.spec.reach_px for other in near)
         if is_known or any(other.is_source or is_veiled for other in near):
             return None
-        displaced = list(near)
+        displaced = near
         if is_veiled:
-            displaced += _find_excess([other for other in spots if not other.is_source], spot, _MOST_VEILED)
+            displaced = _find_excess([other for other in spots if not other.is_source], spot, _MOST_VEILED)
         if len(spots) - len(displaced) >= self.spec.most:
             displaced += _find_excess(spots, spot, self.spec.most)
         return None if any(other is spot for other in displaced) else displaced
@@ -252,8 +251,7 @@ class _SpotDetector:
             return replace(spot, is_source=False, correlation=(), turns=0)
         turns = spot.turns + has_turned
         # One that was there before is a light of its own until it shows that it is not.
-        is_older = spot.found_us + _YOUNG_US < other.found_us
-        is_source = spot.is_source and (bool(spot.correlation) or is_older)
+        is_source = spot.is_source and (bool(spot.correlation) or spot.found_us + _YOUNG_US < other.found_us)
         correlation = self._correlate(place, other_place, start_us, events)
         if spot.correlation:
             correlation = tuple(a + b for a, b in zip(spot.correlation, correlation, strict=True))
@@ -423,8 +421,8 @@ class _SpotDetector:
                 if before.turns + 1 >= _LEAST_TURNS:
                     inside = index == at
                     place = _median(events.x[inside]), _median(events.y[inside])
-                    spot = _Spot(-1, t_us, *place, 0.0, 0.0, _SIZE_PX, float(every[at]), lit, t_us, t_us)
-                    new.append(spot)
+                    burst = float(every[at])
+                    new.append(_Spot(-1, t_us, *place, 0.0, 0.0, _SIZE_PX, burst, lit, t_us, t_us))
         return known, sorted(new, key=lambda spot: -spot.burst)
 
 
