@@ -488,7 +488,7 @@ def main() -> None:
         speeds(given.fixes)
         return
     if given.track:
-        tracks(given.fixes // STEPS)
+        tracks(max(given.fixes // STEPS, 1))
         return
     if given.floor:
         floors(given.fixes)
