@@ -42,7 +42,7 @@ def calibrate(
     position_sigma_m, heading_deg, pitch_deg, roll_deg, attitude_sigma_deg. What the views do not
     determine keeps its configured value, and is named.
     """
-    from evlcp_sdk import run
+    from evlcp_sdk import surveying
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.place.calibration import read_poses
     from evlcp_sdk.plugin.registry import Registry
@@ -52,7 +52,7 @@ def calibrate(
     link = load_link(link_file, overrides or [], registry)
     bars = load_sites(sites)
     known = read_poses(poses)
-    result = run.calibrate(
+    result = surveying.calibrate(
         recordings, bars, known, link, registry=registry, limit_px=limit_px, name=str(poses)
     )
     if as_json:

@@ -45,7 +45,7 @@ def survey(
     poses.csv is that of `evlcp calibrate`, with heading_deg, pitch_deg and roll_deg. What all poses may have
     wrong in common, by position_sigma_m and attitude_sigma_deg, is in the sigmas of the sites.
     """
-    from evlcp_sdk import run
+    from evlcp_sdk import surveying
     from evlcp_sdk.link.several import load_links
     from evlcp_sdk.place.calibration import read_poses
     from evlcp_sdk.plugin.registry import Registry
@@ -63,12 +63,12 @@ def survey(
         ):
             if value is not None:
                 raise typer.BadParameter("needs --sites", param_hint=name)
-        surveyed = run.survey(recordings, read_poses(poses), links, registry=registry, name=str(poses))
+        surveyed = surveying.survey(recordings, read_poses(poses), links, registry=registry, name=str(poses))
     else:
         plan = place.plan(links)
         assert plan is not None
         known = None if place.attitude_file is None else AttitudeLog.read(place.attitude_file)
-        surveyed = run.survey_along_track(recordings, plan, links, attitude=known, registry=registry)
+        surveyed = surveying.survey_along_track(recordings, plan, links, attitude=known, registry=registry)
     _write(surveyed, out, as_json=as_json)
 
 

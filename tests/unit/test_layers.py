@@ -13,7 +13,7 @@ ROWS = {
     "evlcp_sdk": (
         *("errors files kernels lazy printable signals specs stopwatch suggestions", "air"),
         *("values scene clock utc _kernels", "plugin", "link", "io rx place sim", "formatting", "diagnosis"),
-        *("results", "report", "study live", "run simulated warming", "testing", "cli"),
+        *("results", "report", "study live", "run simulated surveying warming", "testing", "cli"),
     ),
     "evlcp_sdk/rx": (
         *("_kernels", "boxes distortion limits", "rhythm sweeps", "guard regions trust", "detector framer"),
