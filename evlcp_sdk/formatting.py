@@ -1,14 +1,16 @@
-"""Values as the files of a result contain them."""
+"""Numbers, values and text as messages and files show them; this imports nothing slow."""
 
 import math
-from collections.abc import Iterable
-from contextlib import suppress
-from typing import Any
+from collections.abc import Mapping, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
 
-from evlcp_sdk.values import Fix
+def format_count(number: int, noun: str) -> str:
+    """A number of things, with separated thousands.
+
+    >>> format_count(1, "frame"), format_count(4000, "frame")
+    ('1 frame', '4,000 frames')
+    """
+    return f"{number:,} {noun}{'s' * (number != 1)}"
 
 
 def format_or_empty(value: float, digits: int) -> str:
@@ -21,41 +23,66 @@ def round_or_none(value: float, digits: int) -> float | None:
     return round(value, digits) if math.isfinite(value) else None
 
 
-def list_symbols(symbols: NDArray[np.int64]) -> list[int | None]:
-    """A frame's symbols; None for negative ones, which are not given."""
-    return [symbol if symbol >= 0 else None for symbol in symbols.tolist()]
+_MAX_SHOWN = 120
 
 
-def decode_characters(symbols: Iterable[int | None]) -> str:
-    """The text of character codes, with the replacement character for those not received.
+def format_value(value: object) -> str:
+    """A value as a message shows it, shortened where it is long."""
+    text = to_toml_value(value) if isinstance(value, bool | int | float | str | list) else str(value)
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
 
-    Bytes beyond ASCII are UTF-8 where that is valid, else Latin-1.
 
-    >>> decode_characters([72, 105, None, 33])
-    'Hi\ufffd!'
+def to_toml_value(value: object) -> str:
+    """A value as TOML on one line, without what is None in a table."""
+    import json
+
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, Mapping):
+        pairs = (f"{key} = {to_toml_value(inner)}" for key, inner in value.items() if inner is not None)
+        return f"{{{', '.join(pairs)}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(to_toml_value, value))}]"
+    return repr(value)
+
+
+def suggest(word: str, known: Sequence[str], kind: str = "known") -> str:
+    """The end of a message about an unknown word: the nearest known one, and all of them.
+
+    >>> suggest("hight", ["height", "width"])
+    "; did you mean 'height'? (known: height, width)"
     """
-    codes = [0xFFFD if symbol is None or symbol < 0 else symbol for symbol in symbols]
-    if max(codes, default=0) > 0x7F and 0xFFFD not in codes and max(codes) < 256:
-        with suppress(UnicodeDecodeError):
-            return bytes(codes).decode()
-    return "".join(map(chr, codes))
+    import difflib
+
+    matches = difflib.get_close_matches(word, known, n=1)
+    hint = f"; did you mean '{matches[0]}'?" if matches else ""
+    return f"{hint} ({kind}: {', '.join(known) or 'none'})"
 
 
-def sigmas(covariance: NDArray[np.float64]) -> list[float]:
-    """Standard deviations of a covariance."""
-    deviations: list[float] = np.sqrt(np.diag(covariance)).tolist()
-    return deviations
+def add_check_hint(fault: str, role: str, id: str) -> str:
+    """Append to an algorithm's fault the command that finds it.
+
+    >>> add_check_hint("pilots algorithm 'mine': gave 3 codes", "pilots", "mine")
+    "pilots algorithm 'mine': gave 3 codes; try: evlcp check pilots mine"
+    """
+    return f"{fault}; try: evlcp check {role} {id}"
 
 
-def integrity_fields(fix: Fix) -> dict[str, Any]:
-    """The integrity of a fix as JSON values: misfit, protection levels, what was left out, alarms."""
-    return {
-        "source": fix.source,
-        "misfit": round_or_none(fix.misfit, 4),
-        "freedom": fix.freedom,
-        "hpl_m": round_or_none(fix.hpl_m, 3),
-        "vpl_m": round_or_none(fix.vpl_m, 3),
-        "excluded": list(fix.excluded),
-        "contradicted": list(fix.contradicted),
-        "alarms": list(fix.alarms),
-    }
+_CONTROLS = {
+    **{n: f"\\x{n:02x}" for n in (*range(0x20), *range(0x7F, 0xA0)) if chr(n) not in "\t\n"},
+    # Marks that turn the direction of a text, and so disguise it.
+    **{n: f"\\u{n:04x}" for n in (0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))},
+}
+
+
+def escape_controls(text: str) -> str:
+    r"""Replace control characters, but tabs and line feeds, by escapes.
+
+    So is a lone surrogate, which stands for a byte of a file's name that is no text.
+
+    >>> print(escape_controls("\x1b]0;mine\x07.raw"))
+    \x1b]0;mine\x07.raw
+    """
+    return text.translate(_CONTROLS).encode("utf-8", "backslashreplace").decode("utf-8")

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_bytes
-from evlcp_sdk.suggestions import suggest
+from evlcp_sdk.formatting import format_value, suggest
 
 T = TypeVar("T")
 Model = TypeVar("Model", bound=BaseModel)
@@ -201,26 +201,3 @@ def make_model(cls: type[Any]) -> type[BaseModel]:
     )
     model: type[BaseModel] = create_model(cls.__name__, __config__=config, **parameters)
     return _MODELS.setdefault(cls, model)
-
-
-_MAX_SHOWN = 120
-
-
-def format_value(value: Any) -> str:
-    """A value as a message shows it, shortened where it is long."""
-    text = to_toml_value(value) if isinstance(value, bool | int | float | str | list) else str(value)
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
-
-
-def to_toml_value(value: Any) -> str:
-    """A value as TOML on one line, without what is None in a table."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, Mapping):
-        pairs = (f"{key} = {to_toml_value(inner)}" for key, inner in value.items() if inner is not None)
-        return f"{{{', '.join(pairs)}}}"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(to_toml_value, value))}]"
-    return repr(value)

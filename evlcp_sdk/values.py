@@ -715,6 +715,12 @@ class Fix:
         )
 
 
+def sigmas(covariance: NDArray[np.float64]) -> list[float]:
+    """Standard deviations of a covariance."""
+    deviations: list[float] = np.sqrt(np.diag(covariance)).tolist()
+    return deviations
+
+
 _V = TypeVar("_V")
 _S = TypeVar("_S", bound=np.generic)
 

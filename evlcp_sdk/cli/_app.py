@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 from typer.models import CommandInfo
 
 from evlcp_sdk.cli._common import echo, log_on_stderr, silence_matplotlib
-from evlcp_sdk.printable import escape_controls
+from evlcp_sdk.formatting import escape_controls
 
 if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._stderr import print_stderr
-from evlcp_sdk.printable import escape_controls
+from evlcp_sdk.formatting import escape_controls
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -3,7 +3,7 @@
 import sys
 from contextlib import suppress
 
-from evlcp_sdk.printable import escape_controls
+from evlcp_sdk.formatting import escape_controls
 
 
 def print_stderr(text: str) -> None:

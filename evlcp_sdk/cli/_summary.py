@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from evlcp_sdk.cli._common import console, print_json
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.cli._tables import print_table
-from evlcp_sdk.suggestions import format_count
+from evlcp_sdk.formatting import format_count
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, print_json
-from evlcp_sdk.suggestions import format_count
+from evlcp_sdk.formatting import format_count
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.calibration import Calibration

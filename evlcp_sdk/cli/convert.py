@@ -9,7 +9,7 @@ import typer
 
 from evlcp_sdk.cli._common import Json, bytes_bar, echo, print_json
 from evlcp_sdk.cli._stderr import print_stderr
-from evlcp_sdk.suggestions import format_count
+from evlcp_sdk.formatting import format_count
 
 
 def convert(

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import Json, Overrides, console, echo, print_json, progress_bar
-from evlcp_sdk.suggestions import format_count
+from evlcp_sdk.formatting import format_count
 
 
 def simulate(

@@ -10,7 +10,7 @@ import typer
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, print_json
 from evlcp_sdk.cli._receiving import PlaceOptions
-from evlcp_sdk.suggestions import format_count
+from evlcp_sdk.formatting import format_count
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, print_json
-from evlcp_sdk.suggestions import format_count
+from evlcp_sdk.formatting import format_count
 
 From = Annotated[
     float | None,

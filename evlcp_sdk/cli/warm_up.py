@@ -15,7 +15,7 @@ def warm_up(as_json: Json = False) -> None:
     """
     from dataclasses import asdict
 
-    from evlcp_sdk.suggestions import format_count
+    from evlcp_sdk.formatting import format_count
     from evlcp_sdk.warming import STEPS, warm_up as warm
 
     with progress_bar("compiling") as advance:

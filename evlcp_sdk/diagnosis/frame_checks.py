@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Findings, format_ms
 from evlcp_sdk.diagnosis.tallies import SURE, TransmitterTally, count_missing_codewords
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.rx.distortion import CORRELATED_FRAMES, are_correlated
-from evlcp_sdk.suggestions import format_count
 
 FEW_FRAMES = 10
 """Frames of a packet by default: fewer are not checked."""

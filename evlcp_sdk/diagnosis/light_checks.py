@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from evlcp_sdk.clock import TimeGrain
 from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Findings, format_ms, has_rate
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import find_ambiguous_links
-from evlcp_sdk.suggestions import format_count
 
 if TYPE_CHECKING:
     from evlcp_sdk.diagnosis.light import LightSource

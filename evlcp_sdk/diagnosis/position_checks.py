@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, Findings
-from evlcp_sdk.suggestions import format_count
+from evlcp_sdk.formatting import format_count
 
 _MAX_IDS = 5
 """Ids that a warning lists; it counts the others."""

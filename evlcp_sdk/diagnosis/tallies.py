@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.formatting import round_or_none, sigmas
+from evlcp_sdk.formatting import round_or_none
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage
+from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage, sigmas
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import EstimatedBias, Navigator, Placed

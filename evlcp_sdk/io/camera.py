@@ -11,11 +11,11 @@ from typing import Any, Final
 import numpy as np
 
 from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
+from evlcp_sdk.formatting import suggest
 from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import ChunkReader, RawSource, format_header
 from evlcp_sdk.io.urls import parse_flag, parse_positive, split_options
 from evlcp_sdk.plugin.source import Loss
-from evlcp_sdk.suggestions import suggest
 
 _MODULES: Final = {"PROPHESEE_EVK4": "prophesee_evk4", "PROPHESEE_EVK3_HD": "prophesee_evk3_hd"}
 """Devices that send EVT3, and the driver's module for each."""

@@ -9,8 +9,8 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from evlcp_sdk.errors import InputError
+from evlcp_sdk.formatting import suggest
 from evlcp_sdk.io.evt import MAX_SIDE
-from evlcp_sdk.suggestions import suggest
 
 
 def split_options(url: str, parsers: Mapping[str, Callable[[str], Any]]) -> tuple[str, dict[str, Any]]:

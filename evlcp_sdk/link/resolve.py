@@ -17,6 +17,7 @@ from evlcp_sdk.air.codebook import Codebook, find_unpaired_codes
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, PluginError, UnknownAlgorithmError
+from evlcp_sdk.formatting import add_check_hint, format_value, suggest
 from evlcp_sdk.link.blocks import BlockCoder, packet_bits
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
 from evlcp_sdk.plugin.records import find_message_kinds
@@ -37,8 +38,7 @@ from evlcp_sdk.plugin.roles import (
 )
 from evlcp_sdk.scene.bar import BarLayout, read_leds
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
-from evlcp_sdk.specs import SpecError, build_spec, format_value, parse_value, read_toml
-from evlcp_sdk.suggestions import add_check_hint, suggest
+from evlcp_sdk.specs import SpecError, build_spec, parse_value, read_toml
 
 _SPECS: dict[str, type[Any]] = {
     "camera": CameraModel,

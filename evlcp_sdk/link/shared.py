@@ -3,9 +3,9 @@
 import numpy as np
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.formatting import format_value
 from evlcp_sdk.link.blocks import packet_bits
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.specs import format_value
 
 _TEST_MESSAGES = 4
 

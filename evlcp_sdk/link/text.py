@@ -3,11 +3,12 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from evlcp_sdk.formatting import to_toml_value
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.bar import SHAPES, BarLayout
-from evlcp_sdk.specs import make_model, to_toml_value
+from evlcp_sdk.specs import make_model
 
 _UNITS = {
     "deg_s": "deg/s",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.formatting import suggest
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.gnss import GnssLog, add_heading, to_camera_fix
@@ -24,7 +25,6 @@ from evlcp_sdk.place.trajectory import (
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.suggestions import suggest
 from evlcp_sdk.values import Fix, Packet
 
 Floats = NDArray[np.float64]

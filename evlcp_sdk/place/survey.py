@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.place.calibration import MOST_MISFIT, CalibrationView, KnownPose, WhitenedView, solve_views
 from evlcp_sdk.place.error_model import DEFAULT_ERRORS, EXACT_CAMERA, ErrorModel
 from evlcp_sdk.place.navigator import Navigator, Placed, Settled
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.suggestions import format_count
 from evlcp_sdk.values import Packet
 
 Floats = NDArray[np.float64]

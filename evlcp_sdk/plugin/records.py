@@ -7,9 +7,9 @@ from typing import Any
 
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.formatting import suggest
 from evlcp_sdk.plugin.hooks import SinkRecord
 from evlcp_sdk.plugin.registry import Owner, Registry, import_class
-from evlcp_sdk.suggestions import suggest
 
 SUMMARY = "summary.json"
 """File of every result that no sink may write."""

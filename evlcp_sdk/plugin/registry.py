@@ -18,10 +18,10 @@ from typing import Any, TypeVar
 import pluggy
 
 from evlcp_sdk.errors import PluginError, PluginWarning, UnknownAlgorithmError
+from evlcp_sdk.formatting import suggest
 from evlcp_sdk.plugin import hooks as hookspecs
 from evlcp_sdk.plugin.hooks import ENTRY_POINT_GROUP, Algorithm
 from evlcp_sdk.plugin.roles import ROLES
-from evlcp_sdk.suggestions import suggest
 
 T = TypeVar("T")
 Owner = tuple[str, str]

@@ -15,6 +15,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import cluster_colours, transmitter_colour
 from evlcp_sdk.report.drawing import INK_COLOUR, draw_plots, set_heading, style_axes
@@ -29,7 +30,6 @@ from evlcp_sdk.report.recording import (
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
-from evlcp_sdk.suggestions import format_count
 from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 _DPI = 150

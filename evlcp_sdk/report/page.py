@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from evlcp_sdk.diagnosis.facts import Diagnostic
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import transmitter_colour
 from evlcp_sdk.report.motion import MotionCollector
@@ -29,7 +30,6 @@ from evlcp_sdk.report.recording import (
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
-from evlcp_sdk.suggestions import format_count
 from evlcp_sdk.values import Frame, Packet, ReceivedMessage
 
 _MOST_MESSAGES = 50

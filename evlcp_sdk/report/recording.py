@@ -13,7 +13,7 @@ from evlcp_sdk.report.colours import transmitter_colour
 from evlcp_sdk.report.plots import DASHES, INK, Plot, choose_ellipse_scale, ellipse_points
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.values import Events, Fix, Frame, Packet
+from evlcp_sdk.values import Events, Fix, Frame, Packet, sigmas
 
 _MOST_TRANSMITTERS, _MOST_FRAMES, _MOST_POSITIONS = 6, 512, 1024
 _MOST_ROWS = 40
@@ -206,17 +206,13 @@ def plot_positions(
     fixes = [point.fix for point in points]
     labels = []
     for fix in fixes:
-        (e, n, u), (se, sn, su) = fix.enu_m.tolist(), _sigmas_m(fix).tolist()
+        (e, n, u), (se, sn, su) = fix.enu_m.tolist(), sigmas(fix.covariance_m2)
         labels.append(
             f"{axis.ms(fix.t_us):.1f} ms, {fix.source}\neast {e:z.3f} ± {se:.2g} m"
             f"\nnorth {n:z.3f} ± {sn:.2g} m\nup {u:z.3f} ± {su:.2g} m"
         )
     plots = [*_plot_maps(points, labels, bars_enu_m), *(_plot_times(points, labels, axis) if points else ())]
     return [plot for plot in plots if not plot.is_empty]
-
-
-def _sigmas_m(fix: Fix) -> NDArray[np.float64]:
-    return np.sqrt(np.diag(fix.covariance_m2))
 
 
 def _track_lines(points: Sequence[Settled]) -> list[tuple[NDArray[np.float64], str, str]]:
@@ -257,7 +253,8 @@ def _plot_maps(
 def _plot_times(points: Sequence[Settled], labels: Sequence[str], axis: TimeAxis) -> list[Plot]:
     fixes = [point.fix for point in points]
     t = axis.times_of(fixes)
-    up, sigma = np.array([fix.enu_m[2] for fix in fixes]), np.array([_sigmas_m(fix) for fix in fixes])
+    up = np.array([fix.enu_m[2] for fix in fixes])
+    sigma = np.array([sigmas(fix.covariance_m2) for fix in fixes])
     height = Plot("height", axis.name, "up, m", "height")
     for line, colour, name in _track_lines(points):
         height.add_line(t, line[:, 2], colour, name)

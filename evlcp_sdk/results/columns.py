@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Literal
 
 from evlcp_sdk.errors import ConfigError, import_extra
-from evlcp_sdk.formatting import format_or_empty, list_symbols, sigmas
-from evlcp_sdk.values import Alternative, Fix, Frame, Packet
+from evlcp_sdk.formatting import format_or_empty
+from evlcp_sdk.values import Alternative, Fix, Frame, Packet, SoftSymbols, sigmas
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import Place
@@ -45,7 +45,7 @@ def frame_value(frame: Frame, column: str) -> Any:
     """
     match column:
         case "symbols":
-            return list_symbols(frame.soft.symbols)
+            return list_symbols(frame.soft)
         case "quality":
             return frame.soft.quality
         case "distance_m":
@@ -58,6 +58,11 @@ def frame_value(frame: Frame, column: str) -> Any:
             return math.nan if frame.filtered is None else frame.filtered.sigma_m
         case _:
             return getattr(frame, column)
+
+
+def list_symbols(soft: SoftSymbols) -> list[int | None]:
+    """A frame's symbols; None for negative ones, which are not given."""
+    return [symbol if symbol >= 0 else None for symbol in soft.symbols.tolist()]
 
 
 def place_row(place: Alternative | Fix | Place) -> list[str]:

@@ -4,12 +4,13 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from evlcp_sdk.formatting import integrity_fields, round_or_none, sigmas
+from evlcp_sdk.formatting import round_or_none
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.lines import integrity_fields
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.trail import Trail
-from evlcp_sdk.values import Fix
+from evlcp_sdk.values import Fix, sigmas
 
 
 class GeoJson(Sink):

@@ -5,10 +5,9 @@ import math
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-from evlcp_sdk.formatting import sigmas
 from evlcp_sdk.place.gnss import geoid_m
 from evlcp_sdk.place.navigator import Place
-from evlcp_sdk.values import Fix
+from evlcp_sdk.values import Fix, sigmas
 
 DEVICE: Final = "evlcp"
 """Name of the only device."""

@@ -4,10 +4,10 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from evlcp_sdk.formatting import integrity_fields, list_symbols, round_or_none, sigmas
-from evlcp_sdk.results.columns import FRAME_COLUMNS, frame_columns, frame_value
+from evlcp_sdk.formatting import round_or_none
+from evlcp_sdk.results.columns import FRAME_COLUMNS, frame_columns, frame_value, list_symbols
 from evlcp_sdk.results.packets_jsonl import message_line
-from evlcp_sdk.values import Fix, Frame, Packet
+from evlcp_sdk.values import Fix, Frame, Packet, sigmas
 
 
 class JsonLines:
@@ -51,7 +51,7 @@ def format_frame(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> str:
     # Written out for hundreds of frames a second: rounding and `json` take twice as long.
     numbers = (
         f'{{"line": "frame", "transmitter": {frame.transmitter}, "packet": {frame.packet},'
-        f' "frame": {frame.frame}, "t_us": {frame.t_us:.2f}, "symbols": {list_symbols(soft.symbols)},'
+        f' "frame": {frame.frame}, "t_us": {frame.t_us:.2f}, "symbols": {list_symbols(soft)},'
         f' "quality": {soft.quality:.4f}, "distance_m": {distance.distance_m:.4f},'
         f' "distance_sigma_m": {distance.sigma_m:.4f}, "x_px": {frame.x_px:.3f}, "y_px": {frame.y_px:.3f},'
         f' "echo_of": {frame.echo_of}'
@@ -80,4 +80,18 @@ def fix_line(fix: Fix) -> dict[str, Any]:
         "refusal": fix.refusal,
         "detail": fix.detail,
         **integrity_fields(fix),
+    }
+
+
+def integrity_fields(fix: Fix) -> dict[str, Any]:
+    """The integrity of a fix as JSON values: misfit, protection levels, what was left out, alarms."""
+    return {
+        "source": fix.source,
+        "misfit": round_or_none(fix.misfit, 4),
+        "freedom": fix.freedom,
+        "hpl_m": round_or_none(fix.hpl_m, 3),
+        "vpl_m": round_or_none(fix.vpl_m, 3),
+        "excluded": list(fix.excluded),
+        "contradicted": list(fix.contradicted),
+        "alarms": list(fix.alarms),
     }

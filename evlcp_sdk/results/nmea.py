@@ -15,13 +15,12 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.formatting import sigmas
 from evlcp_sdk.place.gnss import checksum, geoid_m
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.utc import clock_zero_at
-from evlcp_sdk.values import FailedBar, Fix
+from evlcp_sdk.values import FailedBar, Fix, sigmas
 
 _KNOTS_PER_M_S = 3600 / 1852
 

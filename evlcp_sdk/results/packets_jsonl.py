@@ -1,11 +1,13 @@
 """`packets.jsonl`: a line of JSON a packet, and one per message after the packet that completed it."""
 
 import json
+from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any
 
 from evlcp_sdk.errors import PluginError
-from evlcp_sdk.formatting import decode_characters, list_symbols
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.results.columns import list_symbols
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Packet, ReceivedMessage
@@ -25,6 +27,21 @@ class PacketsJsonl(Sink):
             self._file.write(message_line(message) + "\n")
 
 
+def decode_characters(symbols: Iterable[int | None]) -> str:
+    """The text of character codes, with the replacement character for those not received.
+
+    Bytes beyond ASCII are UTF-8 where that is valid, else Latin-1.
+
+    >>> decode_characters([72, 105, None, 33])
+    'Hi\ufffd!'
+    """
+    codes = [0xFFFD if symbol is None or symbol < 0 else symbol for symbol in symbols]
+    if max(codes, default=0) > 0x7F and 0xFFFD not in codes and max(codes) < 256:
+        with suppress(UnicodeDecodeError):
+            return bytes(codes).decode()
+    return "".join(map(chr, codes))
+
+
 def packet_line(packet: Packet, link: Link) -> dict[str, Any]:
     """A packet's line, as JSON values; null and `?` for what was not received.
 
@@ -36,7 +53,7 @@ def packet_line(packet: Packet, link: Link) -> dict[str, Any]:
     unknown, mask = "?" * width, (1 << width) - 1
     bits = [unknown * codebook.clusters] * packet.sent
     for frame in packet.frames:
-        decoded = symbols[frame.frame] = list_symbols(frame.soft.symbols)
+        decoded = symbols[frame.frame] = list_symbols(frame.soft)
         bits[frame.frame] = "".join([unknown if s is None else f"{s & mask:0{width}b}" for s in decoded])
     return {
         "kind": "packet",

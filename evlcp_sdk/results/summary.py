@@ -9,11 +9,11 @@ from evlcp_sdk.diagnosis.checks import run_checks
 from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import writing
-from evlcp_sdk.formatting import decode_characters
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.records import SUMMARY
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.packets_jsonl import decode_characters
 
 Status = Literal["complete", "degraded", "interrupted", "failed"]
 """How a run ended: read to the end, likewise with much of it dropped, stopped by the user, or by input

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, PluginError
+from evlcp_sdk.formatting import add_check_hint
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Filter, Tracker
-from evlcp_sdk.suggestions import add_check_hint
 from evlcp_sdk.values import Curvature, PresenceMap, Range, SoftSymbols, SyncLock
 
 _MAX_LOCK_PACKETS = 64

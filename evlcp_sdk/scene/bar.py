@@ -14,8 +14,8 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import read_table
-from evlcp_sdk.specs import SpecError, build_spec, format_value
-from evlcp_sdk.suggestions import suggest
+from evlcp_sdk.formatting import format_value, suggest
+from evlcp_sdk.specs import SpecError, build_spec
 
 _MOST_LEDS = 1 << 16
 

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.formatting import suggest, to_toml_value
 from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.specs import SpecError, build_spec, read_toml, to_toml_value
-from evlcp_sdk.suggestions import suggest
+from evlcp_sdk.specs import SpecError, build_spec, read_toml
 
 _LEAST_UPRIGHT = 0.1
 """Sine of a bar axis' elevation below which the bar counts as lying, so that its LEDs face horizontally."""

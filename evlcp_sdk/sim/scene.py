@@ -19,12 +19,12 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import path_exists
+from evlcp_sdk.formatting import format_count, suggest
 from evlcp_sdk.link.resolve import Link, load_led_file, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.specs import SpecError, build_spec, parse_toml, parse_value, read_toml
-from evlcp_sdk.suggestions import format_count, suggest
 
 MOST_PIXELS = 4096
 """Columns and rows of a sensor."""

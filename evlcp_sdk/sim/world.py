@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim.motion import CameraPath
 from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec, links_of
-from evlcp_sdk.suggestions import format_count
 
 Floats = NDArray[np.float64]
 

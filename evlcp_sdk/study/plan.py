@@ -18,7 +18,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.specs import SpecError, build_spec, parse_value, read_toml, to_toml_value
+from evlcp_sdk.formatting import to_toml_value
+from evlcp_sdk.specs import SpecError, build_spec, parse_value, read_toml
 from evlcp_sdk.study.tally import Tally
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS
 from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.report.plots import DASHES, INK, SCRIPT, Plot
@@ -26,7 +27,6 @@ from evlcp_sdk.study.summary import (
     verdict_of,
 )
 from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
-from evlcp_sdk.suggestions import format_count
 
 Dash = Sequence[int]
 

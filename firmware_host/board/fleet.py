@@ -11,10 +11,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.formatting import format_value
 from evlcp_sdk.link.compose import encode_messages, encode_utf8, make_messages
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.specs import SpecError, build_spec, format_value, read_toml
+from evlcp_sdk.specs import SpecError, build_spec, read_toml
 from firmware_host.board.bank import Bank, make_bank, random_packets, read_masks
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.keys import read_board_key

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.formatting import integrity_fields
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.lines import format_frame
+from evlcp_sdk.results.lines import format_frame, integrity_fields
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.scene.attitude import Attitude

@@ -8,14 +8,13 @@ from datetime import UTC, timedelta
 from typing import Any
 from xml.sax.saxutils import escape
 
-from evlcp_sdk.formatting import sigmas
 from evlcp_sdk.place.gnss import geoid_m
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.trail import Trail
 from evlcp_sdk.utc import clock_zero_at
-from evlcp_sdk.values import Fix
+from evlcp_sdk.values import Fix, sigmas
 
 _HEAD = """<?xml version="1.0" encoding="UTF-8"?>
 <kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>{name}</name>

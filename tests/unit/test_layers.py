@@ -11,8 +11,8 @@ SDK = ROOT / "evlcp_sdk"
 
 ROWS = {
     "evlcp_sdk": (
-        *("errors files kernels lazy printable signals specs stopwatch suggestions", "air"),
-        *("values scene clock utc _kernels", "plugin", "link", "io rx place sim", "formatting", "diagnosis"),
+        *("errors files formatting kernels lazy signals specs stopwatch", "air"),
+        *("values scene clock utc _kernels", "plugin", "link", "io rx place sim", "diagnosis"),
         *("results", "report", "study live", "run simulated surveying warming", "testing", "cli"),
     ),
     "evlcp_sdk/rx": (

@@ -115,7 +115,7 @@ def test_the_entry_point_can_be_interrupted_from_the_start() -> None:
     code = "import sys; import evlcp_sdk.cli.main; print(*sys.modules)"
     reported = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert {name.removeprefix("evlcp_sdk") for name in reported.split() if name.startswith("evlcp")} == {
-        *("", ".cli", ".cli.main", ".cli._stderr", ".printable")
+        *("", ".cli", ".cli.main", ".cli._stderr", ".formatting")
     }
     assert not {"typer", "rich", "typing", "pathlib", "logging"} & set(reported.split())
 

@@ -17,8 +17,8 @@ from rich.console import Console
 
 from evlcp_sdk.cli._common import log_on_stderr
 from evlcp_sdk.cli._tables import print_table
+from evlcp_sdk.formatting import escape_controls
 from evlcp_sdk.io import write_events
-from evlcp_sdk.printable import escape_controls
 from evlcp_sdk.values import Events
 
 TITLE = "\x1b]0;mine\x07\x9b31m\u202e"

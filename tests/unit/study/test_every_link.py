@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import chips_of_values, hadamard
+from evlcp_sdk.formatting import to_toml_value
 from evlcp_sdk.plugin.hooks import Algorithm
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Modulation
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, load_scene, truth_of
-from evlcp_sdk.specs import to_toml_value
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.study.tally import Tally
