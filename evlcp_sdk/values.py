@@ -335,9 +335,9 @@ class Range:
     """A distance along the optical axis.
 
     Attributes:
-        distance_m: Depth, m; NaN where the maps allow none.
+        distance_m: Depth, m; NaN where the frame allows none.
         sigma_m: Its standard deviation, m.
-        pairs: Number of cluster pairs that were used.
+        pairs: Number of pairs of clusters, boundaries or clusters that were used.
         late_chips: Of a ranging: chips from the middle of the pilot, the time of a frame's distance, to the
             time for which this distance holds.
         curvature: Of a ranging: the boundaries of the bar; None where it does not give them.
@@ -372,7 +372,7 @@ class Frame:
         frame: Number of the frame in its packet, from 0.
         t_us: Start of the frame's first chip (of its pilot, if it has one), camera clock, us.
         soft: Symbols and log-likelihood ratios.
-        range: Distance; NaN where the maps allow none, or the frame has no pilot.
+        range: Distance; NaN where the frame allows none, or has no pilot.
         filtered: Distance filtered over time; None without tracking.
         x_px: Column of the bar's centre in the middle of the pilot, or of the info segment without one, px.
         y_px: Row of the same, px.

@@ -67,7 +67,7 @@ class BarRegistry:
 
     @property
     def ids(self) -> dict[int, int]:
-        """Ids of the transmitters that sent theirs and were not forged."""
+        """Ids by transmitter, of those that sent theirs in a beacon that is not forged."""
         states = self._states.items()
         return {
             n: s.transmitter_id for n, s in states if s.transmitter_id is not None and s.trust != "forged"

@@ -235,7 +235,7 @@ class GnssLog:
 
 
 def _starts_with_dollar(path: Path) -> bool:
-    """Whether a file does; a pipe, which would lose a byte, does not."""
+    """Whether a file starts with `$`; False for a pipe, which would lose a byte."""
     try:
         if not path.is_file():
             return False

@@ -176,7 +176,7 @@ class KnownAngles(NamedTuple):
 
     @classmethod
     def of(cls, attitude: Attitude | None, vibration_rad: float) -> Self:
-        """Of an attitude, with a vibration that rotates the camera by this sigma."""
+        """The known angles of an attitude, with a vibration that rotates the camera by this sigma."""
         if attitude is None:
             return cls()
         has_heading = attitude.heading_deg is not None

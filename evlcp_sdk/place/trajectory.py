@@ -31,10 +31,10 @@ class DeadReckoning:
     """Propagation of position, m, and velocity, m/s, over a time: east, north, up of each.
 
     Attributes:
-        transition: By what they were, float64 (6, 6).
-        displacement: By a measured acceleration, float64 (6,).
+        transition: Slopes by the earlier position and velocity, float64 (6, 6).
+        displacement: Change by a measured acceleration, float64 (6,).
         noise: Covariance of the unknown part, float64 (6, 6).
-        by_bias: By the IMU's biases in their sigmas, float64 (6, 0, 1 or 4).
+        by_bias: Slopes by the IMU's biases in their sigmas, float64 (6, 0, 1 or 4).
         turn_rad: Change of the heading, clockwise.
     """
 

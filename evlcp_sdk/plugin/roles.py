@@ -2,8 +2,8 @@
 
 An algorithm is a frozen dataclass whose fields are its parameters, each with a default, a unit in its name
 and a description. Pydantic checks the fields when a configuration is loaded; the dataclass itself stays
-plain, picklable and JSON-round-trippable. `compile` precomputes and returns a pure function over arrays; only
-synchronization keeps state, and that state is explicit.
+plain, picklable and JSON-round-trippable. `compile` precomputes and returns a pure function over arrays; the
+state of detection, framing, synchronization and tracking is explicit.
 """
 
 from __future__ import annotations

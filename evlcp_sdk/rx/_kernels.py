@@ -1472,7 +1472,7 @@ def calibrate_llr(
 def fit_newest(
     past: Array, speed_weight: float, curvature_weight: float, worth: float, outlier: float
 ) -> tuple[float, float, float]:
-    """Rate of change at the newest of measurements and its variance, and the variance of the newest, by all.
+    """Fit all measurements: rate of change at the newest and its variance, and the variance of the newest.
 
     `past` (n, 3) holds times, values and variances. Values follow a parabola whose rate and curvature have
     priors of these weights. Squared residuals over the expected ones, with `worth` expected ones added, scale

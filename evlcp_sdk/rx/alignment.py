@@ -44,7 +44,7 @@ class DueFrame:
         start_us: Start of its first chip, us.
         end_us: When the events of its last edge end, us.
         lock: The lock that gives these times.
-        read_us: When the events of the chips that are read after it end, too, us.
+        read_us: When all events that its decoding needs are there, us.
         middle_us: See `AlignedFrame`.
     """
 

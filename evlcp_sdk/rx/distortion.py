@@ -234,7 +234,7 @@ def fit_straight(place: Floats, off_px: Floats, noise_px: float, steepest_px: fl
 
 
 def _fit_smooth(terms: Floats, off_px: Floats, noise_px: float, sigma_px: float) -> tuple[float, float]:
-    """Slope of a line with errors that neighbours posterior, and its variance, by generalised least squares.
+    """Slope of a line with errors that neighbours share, and its variance, by generalised least squares.
 
     Correlation length and size of the errors are unknown: the mean over what is likely.
     """

@@ -52,9 +52,7 @@ def to_camera_time(value: Any, camera_us: Callable[[float], float]) -> Any:
 
 
 class Announcer:
-    """Announces what each finished stage gave, on the camera's clock, and how long it took; nothing to
-    None.
-    """
+    """Announces to a hook what each finished stage gave, on the camera's clock, and how long it took."""
 
     def __init__(self, hook: Callable[..., Any] | None, camera_us: Callable[[float], float]) -> None:
         self._hook, self._camera_us = hook, camera_us
@@ -120,10 +118,10 @@ class Framer(ABC):
         ranging_every: See `Receiver`.
         due_us: When the next frame can be decoded, us; infinite where that waits for the end of a time step.
         patience_us: How late a frame may be given, us.
-        drops_cut_frames: Frames whose late events the stream's end cuts off are not given.
+        drops_frames_at_end: Frames whose late events the stream's end cuts off are not given.
     """
 
-    drops_cut_frames: ClassVar[bool]
+    drops_frames_at_end: ClassVar[bool]
     counts: dict[str, int]
     light_spans_us: dict[int, tuple[float, float]]
     ranging_every: int

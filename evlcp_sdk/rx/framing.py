@@ -87,9 +87,9 @@ class Skipped(StrEnum):
     DARK = "frames_dark"
     """A known bar has too few events."""
     REJECTED = "frames_rejected"
-    """Its clusters are not where the bar has them."""
+    """No bar is found in it, or not where it should be."""
     UNREAD = "frames_unread"
-    """It has clusters, and no symbol that is sure."""
+    """It has no symbol that is sure nor, of a known transmitter, a distance."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class PendingFrame:
         due: Which frame.
         step_us: Start of the time step in which it was due, us.
         ranged: Its distance is measured.
-        fetch_result: Returns what was decoded, once that is known; None to decode the frame again, here.
+        fetch_result: Returns what was decoded once that is known; None if it has to be decoded here.
         frame: The same as published, if it was already.
     """
 
@@ -142,7 +142,7 @@ class PacketFramer(Framer):
     themselves, and applied a fixed number of time steps later, so that it does not matter who decodes them.
     """
 
-    drops_cut_frames = True
+    drops_frames_at_end = True
 
     def __init__(
         self,

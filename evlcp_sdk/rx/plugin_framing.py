@@ -48,7 +48,7 @@ class _DeframedRegion:
 class PluginFramer(Framer):
     """Decodes the regions of a stream by a plugin's framing."""
 
-    drops_cut_frames = False
+    drops_frames_at_end = False
 
     def __init__(
         self,

@@ -88,7 +88,7 @@ class RangeState(NamedTuple):
 class RangeCorrector:
     """Moves distances to the middle of their pilot, corrects them for the bar's tilt, and calibrates sigmas.
 
-    A distance remains that of its frame; other frames give three corrections only. A ranging that uses all of
+    A distance remains that of its frame; other frames give corrections only. A ranging that uses all of
     a frame measures at the frame's middle: the rate of change takes that to the pilot's. A bar that tilts
     towards or from the camera looks shorter, or beside the image's middle longer; its boundaries are then on
     a parabola, whose curvature is far below a frame's noise and adds up over frames. Where the camera's

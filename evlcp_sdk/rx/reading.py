@@ -60,7 +60,7 @@ _NO_LINE_OF_SIGHT = LineOfSight()
 _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
 
 
-class Steps:
+class FrameAlgorithms:
     """The algorithms that decode a frame, checked and announced; it keeps no state of a stream."""
 
     def __init__(self, link: Link, announcer: Announcer, tracker: Tracker) -> None:
@@ -184,7 +184,7 @@ class BarState(NamedTuple):
         pilot: The newest pilot; None where it showed no bar, and before the first.
         frame: Number of the newest decoded frame on the packet grid; -1 before the first.
         symbols: Its symbols, int64 (K,).
-        distance: State of its distance, see `Steps.track_distance`.
+        distance: State of its distance, see `FrameAlgorithms.track_distance`.
     """
 
     pilot: Pilot | None
@@ -234,14 +234,14 @@ class FrameJob(NamedTuple):
 class FrameReader:
     """Reads one aligned frame after the other; it keeps no state of a stream."""
 
-    def __init__(self, link: Link, steps: Steps, aligner: FrameAligner) -> None:
+    def __init__(self, link: Link, algorithms: FrameAlgorithms, aligner: FrameAligner) -> None:
         centres_m, book = link.bar.cluster_centres_m(), link.codebook
         self._camera = link.camera
         self._is_column = float(np.ptp(centres_m[:, 0])) < 1e-9
         self._pilot_chips = link.packet.pilot_chips
         self._least_lit = _MIN_EVENT_SHARE * book.least_edge_ratio
         self._least_half = _DIMMED_SHARE if book.is_pair_coded else 0.0
-        self._steps, self._aligner = steps, aligner
+        self._algorithms, self._aligner = algorithms, aligner
         self._layout = layout_of(centres_m)
         self._pairs = neighbour_pairs(self._layout)
         self._pilots, self._every = book.pilots.astype(np.int64), book.edge_spacing_chips
@@ -266,7 +266,9 @@ class FrameReader:
         distance is measured if it is `ranged`.
         """
         sums, presence, placement = aligned.sums, aligned.pilot.presence, aligned.pilot.placement
-        soft = self._steps.decode(presence, aligned.sums_and_trailing, last_chips, self._behind[due.index])
+        soft = self._algorithms.decode(
+            presence, aligned.sums_and_trailing, last_chips, self._behind[due.index]
+        )
         lit, images = np.empty_like(placement.seen), (sums, presence.probability, presence.grid_px)
         # In a gap of the stream, or behind a passing pole, silence is no symbol.
         outside, darkest, brightest = _kernels.find_lit_clusters(
@@ -284,7 +286,7 @@ class FrameReader:
         distance = NO_RANGE
         if ranged:
             whole = self._aligner.drop_cut_clusters(aligned)
-            distance = self._steps.measure(FrameView(sums, aligned.offset_px, whole, soft))
+            distance = self._algorithms.measure(FrameView(sums, aligned.offset_px, whole, soft))
         pilot_sums = sums[: self._pilot_chips]
         image = self._find_points(presence, placement, pilot_sums, aligned.corner_px)
         # It is needed for two images at one time only; so the pilot alone is kept, not the whole frame.
@@ -309,30 +311,30 @@ class FrameDecoder:
 
     Attributes:
         aligner: Aligns frames.
-        steps: The link's algorithms.
+        algorithms: Those of the link.
     """
 
     def __init__(self, link: Link, announcer: Announcer = SILENT) -> None:
-        self.steps = Steps(link, announcer, compile_tracker(link))
+        self.algorithms = FrameAlgorithms(link, announcer, compile_tracker(link))
         self.aligner = FrameAligner(
             link.packet,
             link.regions,
             link.bar.cluster_centres_m(),
             link.codebook,
-            self.steps.separate,
+            self.algorithms.separate,
             (link.camera.width, link.camera.height),
         )
-        self._reader = FrameReader(link, self.steps, self.aligner)
+        self._reader = FrameReader(link, self.algorithms, self.aligner)
         self._codebook = link.codebook
         self._unknown = np.full(link.codebook.clusters, -1, np.int8)
         self._unknown.setflags(write=False)
 
     def init_state(self) -> BarState:
         """State before a transmitter's first frame."""
-        return BarState(None, -1, np.empty(0, np.int64), self.steps.init_distance())
+        return BarState(None, -1, np.empty(0, np.int64), self.algorithms.init_distance())
 
     def decode(self, job: FrameJob, state: BarState) -> tuple[FrameResult, BarState] | None:
-        """Decode a frame of a known bar, see `read`; None where that takes more than the region's events.
+        """Decode a frame of a known bar, see `read`; None if the region's events are not enough.
 
         Such a frame shows no bar, or not where the region has it, or no symbol: it is to be decoded again
         with what surrounds the region.
@@ -374,10 +376,10 @@ class FrameDecoder:
         # The distance alone is of use only if the transmitter is known.
         is_readable |= known and math.isfinite(reading.distance.distance_m)
         if is_readable:
-            distance, holds, filtered = self.steps.track_distance(
+            distance, corrected, filtered = self.algorithms.track_distance(
                 distance, due.start_us, due.lock.chip_us, reading.distance, reading.line_of_sight
             )
-            reading = reading._replace(distance=holds)
+            reading = reading._replace(distance=corrected)
         placement = aligned.pilot.placement
         seen = max(sum(placement.seen.tolist()), 1)
         state = BarState(aligned.pilot, due.number, reading.symbols, distance)

@@ -306,8 +306,8 @@ class LinkReceiver:
         """Frames, packets and messages received and dropped so far."""
         messages = self._messages.counts if self._messages is not None else {}
         counts = self._tracker.counts | self.framing.counts
-        counts["frames"] -= self._queue.frames_cut
-        counts["frames_at_end"] = self._queue.frames_cut
+        counts["frames"] -= self._queue.frames_at_end
+        counts["frames_at_end"] = self._queue.frames_at_end
         if self.name:
             counts["frames"] -= self._frames_of_others
             counts["frames_of_others"] = self._frames_of_others + self._misses_of_others
@@ -347,7 +347,7 @@ class LinkReceiver:
 
     def set_stream_end(self, end_us: float) -> None:
         """Set when the stream ends, us: frames that this cuts are dropped."""
-        if self.framing.drops_cut_frames:
+        if self.framing.drops_frames_at_end:
             self._queue.stream_end_us = end_us
 
     def finish(self) -> list[Packet]:

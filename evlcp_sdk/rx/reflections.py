@@ -352,7 +352,7 @@ class PacketAssembler:
         return complete
 
     def drop_frames_after(self, last: tuple[int, int]) -> int:
-        """Drop the frames after one, given by packet and frame; return how before."""
+        """Drop the frames after one, given by packet and frame; return how many."""
         before = len(self._frames) + sum(len(packet.frames) for packet in self._done)
         self._frames = [one for one in self._frames if (one.packet, one.frame) <= last]
         kept = [
@@ -387,12 +387,12 @@ class ReflectionQueue:
     Attributes:
         reflections: Finds reflections among the frames.
         stream_end_us: When the stream ends, us: a frame is complete if it goes on for some chips after it.
-        frames_cut: Frames so near to the end of the stream that they were not given.
+        frames_at_end: Frames so near to the end of the stream that they were not given.
     """
 
     reflections: Reflections
     stream_end_us: float = math.inf
-    frames_cut: int = 0
+    frames_at_end: int = 0
     # A frame with its assembler, or, without one, the end of its transmitter's frames.
     _old: list[tuple[PacketAssembler, FrameDetection | None]] = field(default_factory=list)
     _new: list[tuple[PacketAssembler, FrameDetection | None]] = field(default_factory=list)
@@ -406,7 +406,7 @@ class ReflectionQueue:
         self._new.append((assembler, detection))
 
     def end_frames_after(self, assembler: PacketAssembler, last: tuple[int, int]) -> int:
-        """End a transmitter's frames with one, by packet and frame; return how before were dropped."""
+        """End a transmitter's frames with one, by packet and frame; return how many were dropped."""
         dropped = assembler.drop_frames_after(last)
         for waiting in (self._old, self._new):
             before = len(waiting)
@@ -435,7 +435,7 @@ class ReflectionQueue:
             return assembler.flush()
         frame = detection.frame
         if detection.end_us + COMPLETE_AFTER_CHIPS * detection.chip_us > self.stream_end_us:
-            self.frames_cut += 1
+            self.frames_at_end += 1
             return []
         echo_of = self.reflections.echo_of(frame.transmitter)
         if echo_of != frame.echo_of:

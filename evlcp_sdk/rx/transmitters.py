@@ -219,7 +219,7 @@ def retime_lock(lock: SyncLock, start_us: float, pieces: Iterable[tuple[int, Eve
 
 @dataclass
 class Transmitter:
-    """What the receiver knows of one region.
+    """A region that may be a transmitter, and what the receiver knows of it.
 
     Attributes:
         region: Where it is in the image, and its events.

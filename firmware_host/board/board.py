@@ -144,7 +144,7 @@ class Board:
         self.session.call(protocol.WatchdogRequest(action, timeout_ms))
 
     def save(self, autostart: bool = False) -> protocol.SaveReply:
-        """Save active bank and settings to flash."""
+        """Save active bank and settings to flash; with `autostart` the board plays them after a reset."""
         return self.session.call(protocol.SaveRequest(int(autostart)))
 
     def recall(self) -> protocol.RecallReply:
@@ -234,7 +234,7 @@ class Board:
         self.session.call(protocol.CodebookRequest(*preamble, pilots, digest))
 
     def _hold_count(self, bank: Bank) -> int:
-        """Times that the board repeats a chip of the bank; above 1 if it has no chips as long as these."""
+        """Times that the board repeats a chip of the bank; above 1 if these are longer than its longest."""
         info, rate = self.info, bank.chip_rate_hz
         if not bank.composed:
             for hold in range(1, min(_MOST_HOLD, info.chip_rate_max_hz // rate) + 1):

@@ -59,7 +59,7 @@ def watch_board(
         interval_s: Time between two requests for the status, s.
         count: Number of statuses; None for no end.
         reconnect: Whether to reconnect to a lost board, at growing intervals of at most 5 s.
-        at_first: Whether to try so before its first answer, too.
+        at_first: Whether to try again before the board has answered once, too.
         end: Ends it early, when set.
 
     Raises:

@@ -127,7 +127,7 @@ def fit_peaks(
 ) -> None:
     """Find peaks of correlations (2 n + 1, pairs, 2 m + 1), `shifts` (pairs, 2): down, right of the middle.
 
-    A peak is sought where there are so many `samples` to each side; these, of its row and its column, are
+    A peak is sought at least `samples` from the edges; the samples around it, of its row and its column, are
     fitted (least squares) by the Dirichlet kernel of their band: the sum of 2 `most` + 1 harmonics out of
     `size`. The best gain follows from the shift, so that Gauss-Newton steps run over the shift alone
     (variable projection). The sines of the samples follow from those of the first by rotation.

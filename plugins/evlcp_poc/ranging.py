@@ -36,7 +36,7 @@ class PocRanging(Ranging):
     the variance falls with the spacing squared, which gives the weights. The spread over clusters (delete-one
     jackknife, since pairs share clusters) gives sigma.
 
-    That of the paper; a bar's default is `joint-scale`, so that this one takes `ranging.id = "poc"`.
+    The paper's method; the default is `joint-scale`, so choose this by `ranging.id = "poc"`.
 
     The spectrum of a map falls off beyond half a cycle a blob size, and the phases there are the noise's, but
     count as much in the paper's method, `band = "full"`. With `band = "blob"` only the frequencies that the
