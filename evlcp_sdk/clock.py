@@ -27,19 +27,19 @@ _AGREE_EVENTS = 16
 _AGREE_US = 10_000
 """Successive events, and the time they span, that confirm a leap: two TIME_HIGH words of EVT3."""
 
-_MOST_HELD = 1 << 20
+_MAX_HELD = 1 << 20
 """Most events that are held; so many confirm a leap whatever their time."""
 
 _BREAK_US = 4_000_000
 """Pause in stream time at a leap: all that was seen before is forgotten after it."""
 
-_MOST_BREAKS = 64
+_MAX_BREAKS = 64
 """Leaps that are remembered: packets are complete long before so many more, at `_BREAK_US` each."""
 
 _FARTHEST_US = 1 << 62
 """Farthest time from 0 that an event may have."""
 
-_MOST_PIECES, _PIECE_EVENTS = 64, 4096
+_MAX_PIECES, _PIECE_EVENTS = 64, 4096
 """Pieces of a time step that may wait to be joined, and one more for every so many events: small pieces take
 more memory than their events."""
 
@@ -82,8 +82,8 @@ class CameraClock:
         self.last_us = -_FARTHEST_US
         self._size = width, height
         self._offset_us = 0
-        self._starts_us: deque[int] = deque(maxlen=_MOST_BREAKS)
-        self._offsets_us: deque[int] = deque(maxlen=_MOST_BREAKS)
+        self._starts_us: deque[int] = deque(maxlen=_MAX_BREAKS)
+        self._offsets_us: deque[int] = deque(maxlen=_MAX_BREAKS)
         # Camera clock of the last event kept; of the first and the last held; how many are held.
         self._state = np.zeros(4, np.int64)
         self._held: list[Events] = []
@@ -147,7 +147,7 @@ class CameraClock:
     def _sort_events(self, events: Events) -> list[Events]:
         """Judge events one by one; return those that are kept, in stream time."""
         held_us = _FARTHEST_US if self._is_sparse else LEAP_US
-        limits = (LEAP_US, held_us, _SETBACK_US, _AGREE_EVENTS, _AGREE_US, _MOST_HELD, _FARTHEST_US)
+        limits = (LEAP_US, held_us, _SETBACK_US, _AGREE_EVENTS, _AGREE_US, _MAX_HELD, _FARTHEST_US)
         pieces: list[Events] = []
         while len(events):
             verdicts = np.empty(len(events), np.uint8)
@@ -367,7 +367,7 @@ class Timeline:
             return
         self._pending_events += number
         self._pending.append(events)
-        if len(self._pending) > _MOST_PIECES + self._pending_events // _PIECE_EVENTS:
+        if len(self._pending) > _MAX_PIECES + self._pending_events // _PIECE_EVENTS:
             self._pending = [Events.concat(self._pending)]
 
     def _finish_step(self, end_us: int | None = None) -> TimeStep:

@@ -45,7 +45,7 @@ RECEIVED = "received"
 _CHIPS = "chips.npy"
 """Name of the file with the LEDs' chips."""
 
-_LEAST_PACKETS = 8
+_MIN_PACKETS = 8
 """Least number of packets in view: a quarter of a second of the default link."""
 
 _TRANSMITTER_ID = 1
@@ -169,7 +169,7 @@ def run_loop(
     yield _message_step(text, message, symbols, link, folder)
 
     # Every packet is seen whole, the second time if the first began before the camera.
-    in_view = max(_LEAST_PACKETS, 2 * len(symbols) + 2)
+    in_view = max(_MIN_PACKETS, 2 * len(symbols) + 2)
     light = light_of(symbols, link, (in_view + 2) * link.packet.packet_chips, folder / "wire.jsonl")
     programmed = light.programmed
     yield Step(

@@ -14,7 +14,7 @@ FORMAT_VERSION = 1
 DIGEST_BYTES = 4
 """Bytes of the codebook's digest in a header: those of two codebooks agree by chance once in 2**32."""
 
-MOST_MESSAGE_BYTES = 0xFFFF
+MAX_MESSAGE_BYTES = 0xFFFF
 """Longest message that the header's length can express."""
 
 _HEADER = struct.Struct("<BIIHH4s")
@@ -27,7 +27,7 @@ _WHITE_SEED = 2463534242
 """Start of the whitening if the header's CRC is 0, where xorshift32 would stay."""
 
 _LARGEST_NUMBER = 0xFFFFFFFF
-_MOST_PARTS = 0x10000
+_MAX_PARTS = 0x10000
 
 
 class Kind(IntEnum):
@@ -75,9 +75,9 @@ class Message:
             value = getattr(self, name)
             if not 0 <= value <= _LARGEST_NUMBER:
                 raise ConfigError(f"message: {name} = {value}, expected 0 to {_LARGEST_NUMBER}")
-        if not 1 <= len(self.payload) <= MOST_MESSAGE_BYTES:
+        if not 1 <= len(self.payload) <= MAX_MESSAGE_BYTES:
             raise ConfigError(
-                f"message: {len(self.payload)} bytes of {self.kind_name}, expected 1 to {MOST_MESSAGE_BYTES}"
+                f"message: {len(self.payload)} bytes of {self.kind_name}, expected 1 to {MAX_MESSAGE_BYTES}"
             )
 
     @property
@@ -207,8 +207,8 @@ def split_message(message: Message, codebook: bytes, size: int) -> Iterator[Bloc
     """
     room, length = size - HEADER_BYTES, len(message.payload)
     content = message.payload if length <= room else message.payload + _crc(message.payload)
-    if len(content) > room * _MOST_PARTS:
-        raise ConfigError(f"message: {length} bytes in parts of {room}, expected at most {_MOST_PARTS} parts")
+    if len(content) > room * _MAX_PARTS:
+        raise ConfigError(f"message: {length} bytes in parts of {room}, expected at most {_MAX_PARTS} parts")
     for index, begin in enumerate(range(0, len(content), room)):
         yield Block(
             message.kind,

@@ -27,7 +27,7 @@ KEY_NAME_BYTES = 8
 
 _SIGNATURE_BYTES = 64
 _KEY_BYTES = 32
-_MOST_PEM_BYTES = 1 << 16
+_MAX_PEM_BYTES = 1 << 16
 _DOMAIN = b"EVLCP beacon 1\0"
 _SIGNED_HEAD = struct.Struct("<II4s")
 
@@ -69,7 +69,7 @@ def read_key(path: Path) -> "Ed25519PrivateKey":
     from cryptography.hazmat.primitives import serialization
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-    text = read_secret(path, _MOST_PEM_BYTES)
+    text = read_secret(path, _MAX_PEM_BYTES)
     try:
         key = serialization.load_pem_private_key(text, password=None)
     except (ValueError, TypeError, UnsupportedAlgorithm) as fault:

@@ -51,12 +51,12 @@ NEAR_US: Final = 10_000
 
 # After missing bytes all words are misaligned. Of aligned words none is of a reserved type, of others a
 # third. Of `ALIGNMENT_WORDS` at least `ALIGNMENT_RESERVED` have to be reserved, eight times as many as from
-# another first byte on, from which times have to step by less than `MOST_STEP_US`. Aligned words are checked
+# another first byte on, from which times have to step by less than `MAX_STEP_US`. Aligned words are checked
 # again after `ALIGNED_WORDS`, uncertain ones after `RECHECK_WORDS`, and at any TIME_HIGH that does not step
 # by one.
 ALIGNMENT_WORDS: Final = 256
 ALIGNMENT_RESERVED: Final = 8
-MOST_STEP_US: Final = 1_000_000
+MAX_STEP_US: Final = 1_000_000
 ALIGNED_WORDS: Final = 64
 RECHECK_WORDS: Final = 8
 
@@ -215,7 +215,7 @@ def _find_misalignment(
             if word >> top != 8:
                 continue
             if before >= 0:
-                if ((word - before) & ring) << low_bits <= MOST_STEP_US:
+                if ((word - before) & ring) << low_bits <= MAX_STEP_US:
                     return shift
                 break
             before = word & ring

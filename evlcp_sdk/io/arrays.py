@@ -21,9 +21,9 @@ _SAMPLE_ROWS: Final = 1 << 14
 """Rows at the start by which columns are recognized."""
 
 _TRIGGER_ROWS: Final = 1 << 12
-_MOST_COLUMNS: Final = 8
+_MAX_COLUMNS: Final = 8
 
-_MOST_RATIO, _SMALL_BYTES = 100, 1 << 29
+_MAX_RATIO, _SMALL_BYTES = 100, 1 << 29
 """Most ratio of unpacked bytes to an archive's own, where events make 16; unpacked bytes always allowed."""
 
 
@@ -99,7 +99,7 @@ def _choose_table(
                 raise
             continue
         parts: Sequence[Any] = table.dtype.names or ()
-        if len(table.shape) == 2 and 1 < table.shape[1] <= _MOST_COLUMNS:
+        if len(table.shape) == 2 and 1 < table.shape[1] <= _MAX_COLUMNS:
             parts = [(slice(None), k) for k in range(table.shape[1])]
         columns: list[Array] = [table[part] for part in parts]
         found = fields or fields_from_names(table.dtype.names or ()) or _fields_from_sample(columns)
@@ -168,7 +168,7 @@ def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
         raise InputError(f"{path}: found no NPZ file, expected one ({error})") from error
     names = [member.removesuffix(".npy") for member in archive.namelist() if member.endswith(".npy")]
     size, unpacked = path.stat().st_size, sum(member.file_size for member in archive.infolist())
-    if unpacked > _MOST_RATIO * size + _SMALL_BYTES:
+    if unpacked > _MAX_RATIO * size + _SMALL_BYTES:
         raise InputError(f"{path}: {size} bytes are declared to unpack to {unpacked}, more than events can")
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="evlcp-"))
 

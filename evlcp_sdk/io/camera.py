@@ -26,7 +26,7 @@ _WAIT_S: Final = 0.05
 _PERIOD_US: Final = 200
 """The event-rate limit counts events in periods of this length."""
 
-_MOST_PER_PERIOD: Final = (1 << 22) - 1
+_MAX_PER_PERIOD: Final = (1 << 22) - 1
 
 _RING_PACKETS: Final = 1024
 """USB packets of 128 KB in the driver's ring: a second of the most that a camera sends."""
@@ -37,7 +37,7 @@ libusb's thread is still giving up. That takes milliseconds, unless other work h
 
 _HEALTH_PERIOD_S: Final = 5.0
 
-_MOST_FAULTS: Final = 8
+_MAX_FAULTS: Final = 8
 
 _UNPLUGGED: Final = ("NoDevice", "No such device", "Rusb(Io", "Input/output", "Pipe")
 _HINTS: Final = (
@@ -174,7 +174,7 @@ class _CameraReader(ChunkReader):
                 except (RuntimeError, StopIteration) as fault:
                     # The driver fails before it gives what it still holds, and may fail twice.
                     self._faults.append(fault)
-                    if len(self._faults) <= _MOST_FAULTS:
+                    if len(self._faults) <= _MAX_FAULTS:
                         continue
                     status = data = None
                 if data is None and self._faults:
@@ -224,8 +224,8 @@ def _parse_integer(text: str) -> int:
 
 def _parse_rate(text: str) -> float:
     rate = parse_positive(text)
-    if not 1 <= rate * _PERIOD_US * 1e-6 <= _MOST_PER_PERIOD:
-        raise ValueError(f"{1e6 / _PERIOD_US:g} to {_MOST_PER_PERIOD * 1e6 / _PERIOD_US:.3g} events a second")
+    if not 1 <= rate * _PERIOD_US * 1e-6 <= _MAX_PER_PERIOD:
+        raise ValueError(f"{1e6 / _PERIOD_US:g} to {_MAX_PER_PERIOD * 1e6 / _PERIOD_US:.3g} events a second")
     return rate
 
 

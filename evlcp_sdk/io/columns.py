@@ -23,13 +23,13 @@ from evlcp_sdk.values import Events, Triggers
 
 PIECE_ROWS: Final = 1 << 16
 
-MOST_WAITING_ROWS: Final = 1 << 20
+MAX_WAITING_ROWS: Final = 1 << 20
 """Rows that wait for earlier ones; a table of fewer rows may be in any order."""
 
 WINDOW_US: Final = 10_000
 """How late an event of a camera may come and still be sorted in, us."""
 
-_MOST_SIDE: Final = 1 << 16
+_MAX_SIDE: Final = 1 << 16
 
 _COARSE_US: Final = 20
 """Least step of times to report, us: a fifth of a chip of 100 us; slower lights allow more."""
@@ -168,7 +168,7 @@ class ColumnSource(EventSource):
         pieces, waiting, fault, has_more = self._convert_pieces(), list[Events](), None, True
         while has_more:
             try:
-                while has_more and sum(map(len, waiting)) < MOST_WAITING_ROWS:
+                while has_more and sum(map(len, waiting)) < MAX_WAITING_ROWS:
                     events = next(pieces, None)
                     has_more = events is not None
                     waiting += [] if events is None else [events]
@@ -354,10 +354,10 @@ def _find_present(column: NDArray[Any]) -> Any:
 
 
 def _to_pixels(places: NDArray[Any]) -> NDArray[np.uint16]:
-    wrong = ~((places >= 0) & (places < _MOST_SIDE) & (places == np.rint(places)))
+    wrong = ~((places >= 0) & (places < _MAX_SIDE) & (places == np.rint(places)))
     if wrong.any():
         row = int(wrong.argmax())
-        raise RowError(row, f"place {places[row]}, expected whole numbers from 0 to {_MOST_SIDE - 1}")
+        raise RowError(row, f"place {places[row]}, expected whole numbers from 0 to {_MAX_SIDE - 1}")
     return places.astype(np.uint16)
 
 

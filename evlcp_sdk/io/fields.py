@@ -43,30 +43,30 @@ _PAIRS: Final = (
 _ON: Final = frozenset(on for on, _ in _PAIRS)
 _OFF: Final = frozenset(off for _, off in _PAIRS)
 
-LEAST_RATE_HZ: Final = 20.0
-MOST_RATE_HZ: Final = 5e7
+MIN_RATE_HZ: Final = 20.0
+MAX_RATE_HZ: Final = 5e7
 """Events a second of pixels that see a blinking light; with fewer or more it is another unit."""
 
-MOST_SENSOR_RATE_HZ: Final = 5e8
+MAX_SENSOR_RATE_HZ: Final = 5e8
 """Most events a second of a whole sensor: half of what the fastest can read out."""
 
 _BLINK_RATES_HZ: Final = (100.0, 6e4)
 """Chips or bits a second at which lights blink, edges of each bit included."""
 
-_LEAST_LINE_RATIO: Final = 30.0
+_MIN_LINE_RATIO: Final = 30.0
 """Least ratio of a spectral line of a blinking light to the median around it; noise reaches 17 at one of 10^5
 frequencies."""
 
-_LEAST_UNIT_RATIO: Final = 2.0
+_MIN_UNIT_RATIO: Final = 2.0
 """Least ratio of that line to the one by the next unit."""
 
-_MOST_BINS: Final = 1 << 18
+_MAX_BINS: Final = 1 << 18
 
 _LEVELS: Final = ((0, 1), (-1, 1), (1, 2), (255, 1), (0, 255))
 """Numbers for OFF and ON."""
 
-_LEAST_SPAN_S: Final = 0.1
-_LEAST_INTEGER_SPAN_S: Final = 0.01
+_MIN_SPAN_S: Final = 0.1
+_MIN_INTEGER_SPAN_S: Final = 0.01
 _PLAUSIBLE_RATES_HZ: Final = (200.0, 2e6)
 """Least length of a list, least length of one of whole numbers, and plausible rates of pixels that see a
 light. Where a list would be shorter or have a higher rate, its times were rounded to a unit a thousand times
@@ -316,12 +316,12 @@ def infer_time_unit(
     """
     inside = np.sort(times[np.isfinite(times)])
     span = float(np.ptp(inside)) if len(inside) else 0.0
-    most_hz = MOST_SENSOR_RATE_HZ if has_pixels else MOST_RATE_HZ
+    most_hz = MAX_SENSOR_RATE_HZ if has_pixels else MAX_RATE_HZ
     rates_hz = {
-        unit: (len(inside) - 1) / (span * length_us * 1e-6) if span > 0 else LEAST_RATE_HZ
+        unit: (len(inside) - 1) / (span * length_us * 1e-6) if span > 0 else MIN_RATE_HZ
         for unit, length_us in UNITS_US.items()
     }
-    likely = tuple(unit for unit, rate in rates_hz.items() if span > 0 and LEAST_RATE_HZ <= rate <= most_hz)
+    likely = tuple(unit for unit, rate in rates_hz.items() if span > 0 and MIN_RATE_HZ <= rate <= most_hz)
     blinks = _infer_from_blinking(inside)
     if named is not None:
         unit, rate_hz = blinks or (named, 0.0)
@@ -344,7 +344,7 @@ def _infer_from_digits(
     inside: NDArray[Any], rates_hz: dict[str, float], likely: tuple[str, ...], share: float, has_pixels: bool
 ) -> TimeUnit:
     """Return the unit whose digits the times show, or the next one if events come too close or too far."""
-    most_hz = MOST_SENSOR_RATE_HZ if has_pixels else MOST_RATE_HZ
+    most_hz = MAX_SENSOR_RATE_HZ if has_pixels else MAX_RATE_HZ
     are_whole, since = bool((inside == np.round(inside)).all()), inside - inside[:1]
     if are_whole and since.any() and (since % 1000 == 0).all() and rates_hz["ns"] <= most_hz:
         shown, digits = "ns", "whole numbers, multiples of 1000"
@@ -361,14 +361,14 @@ def _infer_from_digits(
         if has_pixels:
             too_close = rates_hz[shown] > most_hz and longer in likely
         else:
-            least_s = share * (_LEAST_INTEGER_SPAN_S if shown == "us" else _LEAST_SPAN_S)
+            least_s = share * (_MIN_INTEGER_SPAN_S if shown == "us" else _MIN_SPAN_S)
             too_close = rates_hz[shown] > sure_hz or (len(inside) - 1) / rates_hz[shown] < least_s
             too_close &= least_hz <= rates_hz[longer] <= sure_hz
         if too_close:
             return TimeUnit(longer, f"guessed: {digits}, too close for {shown}", likely)
     # Nanoseconds have no decimals.
     shorter, last = (units[at:], shown) if are_whole else (units[at:-1], "us")
-    unit = next((unit for unit in shorter if rates_hz[unit] >= LEAST_RATE_HZ), last)
+    unit = next((unit for unit in shorter if rates_hz[unit] >= MIN_RATE_HZ), last)
     why = f", too far apart for {shown}" if unit != shown else ""
     why += f", {rates_hz[unit]:.3g} events/s" if unit in likely else ""
     return TimeUnit(unit, f"guessed: {digits}{why}", likely)
@@ -378,9 +378,9 @@ def _infer_from_blinking(inside: NDArray[Any]) -> tuple[str, float] | None:
     """Return the only unit in which a light blinks, and its spectral line, Hz; None without one."""
     lines = (_find_spectral_line(inside * factor, unit) for unit, factor in UNITS_US.items())
     found = sorted((line for line in lines if line is not None), reverse=True)
-    if not found or found[0][0] < _LEAST_LINE_RATIO:
+    if not found or found[0][0] < _MIN_LINE_RATIO:
         return None
-    if len(found) > 1 and found[0][0] < _LEAST_UNIT_RATIO * found[1][0]:
+    if len(found) > 1 and found[0][0] < _MIN_UNIT_RATIO * found[1][0]:
         return None
     return found[0][1], found[0][2]
 
@@ -401,7 +401,7 @@ def _find_spectral_line(t_us: NDArray[Any], unit: str) -> tuple[float, str, floa
         return None
     # Bins of whole steps, so that they do not beat with them.
     bin_us = float(steps.min()) * max(int(1e6 / (4 * high_hz) / float(steps.min())), 1)
-    bins = min(int(since_us[-1] / bin_us), _MOST_BINS) + 1
+    bins = min(int(since_us[-1] / bin_us), _MAX_BINS) + 1
     counted = np.bincount(np.minimum(since_us / bin_us, bins).astype(np.int64), minlength=bins + 1)[:bins]
     power = np.abs(np.fft.rfft((counted - counted.mean()) * np.hanning(bins))) ** 2
     frequency_hz = np.fft.rfftfreq(bins, bin_us * 1e-6)

@@ -43,7 +43,7 @@ _UTF_16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _SAMPLE_LINES: Final = 512
 """Lines at the start by which columns are recognized."""
 
-_MOST_TITLE_LINES: Final = 10
+_MAX_TITLE_LINES: Final = 10
 """Most lines above a table: a title, the recorder's name, `sep=;`."""
 
 _CONTROL_CHARACTERS: Final = re.compile(r"[\0-\x08\x0b-\x1f\x7f]")
@@ -198,7 +198,7 @@ class _TextTable:
             return
         # A heading may stand in a comment, as numpy.savetxt writes it.
         above = [line.strip().lstrip("#%/").strip() for line in lines[: self.first - 1]]
-        for top, (number, line) in enumerate(data[:_MOST_TITLE_LINES]):
+        for top, (number, line) in enumerate(data[:_MAX_TITLE_LINES]):
             found = self._recognize_columns([line for _, line in data[top:]], above)
             if found is not None:
                 self.fields, names = found

@@ -1,6 +1,6 @@
 "use strict";
 const by = (id) => document.getElementById(id);
-const KEEP_S = 60, BIN_S = 0.1, MOST_ROWS = 12, MOST_MESSAGES = 50, MOST_FIXES = 2000, MOST_ZOOMS = 4;
+const KEEP_S = 60, BIN_S = 0.1, MAX_ROWS = 12, MAX_MESSAGES = 50, MAX_FIXES = 2000, MAX_ZOOMS = 4;
 let about = null, run = null, socket = null, wait = 250;
 // All that is shown; `shown` is what a test, or a curious reader, may look at.
 const shown = { pictures: 0, frames: 0, fixes: 0, connects: 0, dropped: 0, last: [] };
@@ -34,7 +34,7 @@ function takeNews(news) {
     shown.last.push(news);
     if (shown.last.length > 400) shown.last.splice(0, 200);
     rows.push(news);
-    if (rows.length > MOST_ROWS) rows.shift();
+    if (rows.length > MAX_ROWS) rows.shift();
     const before = distances.get(news.transmitter);
     // Frames without a pilot have no distance: the last one is still shown.
     const ranged = news.distance_m !== null ? news : before ? before.ranged : null;
@@ -50,13 +50,13 @@ function takeNews(news) {
     if (news.late_ms !== null) bin.late = Math.max(bin.late, news.late_ms);
   } else if (news.line === "message") {
     messages.unshift(news);
-    messages.length = Math.min(messages.length, MOST_MESSAGES);
+    messages.length = Math.min(messages.length, MAX_MESSAGES);
   } else if (news.line === "fix") {
     shown.fixes++;
     if (news.enu_m === undefined) { refused = news; return; }
     refused = null;
     fixes.push(news);
-    if (fixes.length > MOST_FIXES) fixes.shift();
+    if (fixes.length > MAX_FIXES) fixes.shift();
   } else if (news.line === "bars") {
     sites = news.bars;
   } else if (news.line === "status") {
@@ -128,7 +128,7 @@ function drawImage() {
 
 function drawZooms() {
   const near = bars.filter((bar) => bar.echo_of === null).sort((a, b) => a.transmitter - b.transmitter)
-    .slice(0, MOST_ZOOMS);
+    .slice(0, MAX_ZOOMS);
   for (const [number, figure] of zooms) {
     if (!near.some((bar) => bar.transmitter === number)) { figure.remove(); zooms.delete(number); }
   }

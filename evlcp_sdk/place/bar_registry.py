@@ -15,7 +15,7 @@ from evlcp_sdk.values import Packet
 _LENGTH_SHARE = 0.01
 """Share by which a beacon's length may differ from its site's: a lone bar's distance is wrong by as much."""
 
-_MOST_TRANSMITTERS = 1024
+_MAX_TRANSMITTERS = 1024
 """Transmitters whose beacons are remembered; then the one not received for longest is dropped."""
 
 _ACCEPTED_TRUST = {"none": (), "verified": ("verified",), "any": ("verified", "lapsed", "unverified")}
@@ -98,7 +98,7 @@ class BarRegistry:
             return
         state = self._states[packet.transmitter] = self._states.pop(packet.transmitter, _BeaconState())
         state.link = packet.link
-        if len(self._states) > _MOST_TRANSMITTERS:
+        if len(self._states) > _MAX_TRANSMITTERS:
             del self._states[next(iter(self._states))]
         for received in packet.messages:
             if received.trust == "forged":

@@ -123,10 +123,10 @@ _STEPS = 60
 _FREE_SIGMA_RAD = 0.5
 """Sigma of an unknown attitude about its closed-form start."""
 
-_MOST_SIGMAS = 4.0
+_MAX_SIGMAS = 4.0
 """Prior sigmas, 1 in 16 000, beyond which it is not the lens or its mount that is wrong."""
 
-MOST_MISFIT = 4.0
+MAX_MISFIT = 4.0
 """Mean square of the residuals, in sigmas, above which no result is given."""
 
 _CAMERA_SIZE, _BAR_SIZE = len(CAMERA_PARAMETERS), 8
@@ -223,14 +223,14 @@ def fit_camera(
             "the views do not determine the focal length: the image's corners stay uncertain by"
             f" {corner['focal_mm']:.1f} px, {limit_px:g} px allowed"
         )
-    if misfit > MOST_MISFIT:
+    if misfit > MAX_MISFIT:
         raise ConfigError(
             f"the views miss their places by {math.sqrt(misfit):.1f} sigmas (rms):"
             " a site or pose is not as stated"
         )
     for name in CAMERA_PARAMETERS[1:]:
         value, configured = getattr(found, name), getattr(start, name)
-        if abs(value - configured) > _MOST_SIGMAS * usual[name]:
+        if abs(value - configured) > _MAX_SIGMAS * usual[name]:
             raise ConfigError(
                 f"{name} = {value:.4g} would fit the views, {configured:.4g} is configured and"
                 f" {usual[name]:.2g} a usual difference: angles of the poses, a place, or the configuration"

@@ -28,7 +28,7 @@ _HEADINGS = 72
 _FINE_HEADINGS = 25
 """Headings tried around each minimum of these: 0.4 degrees apart."""
 
-_MOST_STARTS = 4
+_MAX_STARTS = 4
 """Starts of one problem, at most."""
 
 _FALSE_RATIO, _FALSE_PX = 10.0, 0.5
@@ -103,7 +103,7 @@ def _find_level_starts(enu: Floats, directions: Floats, level: Floats) -> list[t
     _, costs = intersect_sight_lines(enu, directions, _rotate_about_up(level, headings))
     is_minimum = (costs <= np.roll(costs, 1)) & (costs <= np.roll(costs, -1)) & (costs < math.inf)
     starts = []
-    for minimum in sorted(np.flatnonzero(is_minimum).tolist(), key=costs.__getitem__)[:_MOST_STARTS]:
+    for minimum in sorted(np.flatnonzero(is_minimum).tolist(), key=costs.__getitem__)[:_MAX_STARTS]:
         fine = headings[minimum] + step * np.linspace(-1.0, 1.0, _FINE_HEADINGS)
         rotations = _rotate_about_up(level, fine)
         places, fine_costs = intersect_sight_lines(enu, directions, rotations)
@@ -179,7 +179,7 @@ def solve_three_points(enu_m: Floats, directions: Floats) -> list[tuple[Floats, 
             in_camera = math.sqrt(b2 / square) * np.array([[1.0], [u], [v]]) * directions
             rotation = _triangle_axes(enu_m).T @ _triangle_axes(in_camera)
             poses.append((enu_m.mean(0) - rotation @ in_camera.mean(0), rotation))
-    return poses[:_MOST_STARTS]
+    return poses[:_MAX_STARTS]
 
 
 def _triangle_axes(points: Floats) -> Floats:

@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 FOCAL = "focal length"
 """Name of a fault of the camera."""
 
-_MOST_CURVATURE = 3.0
+_MAX_CURVATURE = 3.0
 """Ratio of the cost two sigmas away to its parabola's, beyond which an ellipse does not describe it."""
 
 _BAR_TURN_RAD = math.radians(5.0)
@@ -56,7 +56,7 @@ _FAR_COST = 12.0
 _ANYWHERE_M2 = 1e24
 """Variance of a position that a fault may move anywhere."""
 
-_LEAST_REDUNDANCY = 1e-6
+_MIN_REDUNDANCY = 1e-6
 """Share of a part's information that others must have, too, for it to be tested: as much as a heading known
 to 0.1 degrees, 13 px, has of that in a bar's image seen to .013 px. Less is rounding."""
 
@@ -119,7 +119,7 @@ def assess_fit(fit: Equations) -> Pose | Rejection:
     curvature, slopes = _measure_curvature(fit, variances, axes)
     has_misfit = is_misfit(fit)
     # A misfit need not be at the least cost.
-    if curvature > _MOST_CURVATURE and not has_misfit:
+    if curvature > _MAX_CURVATURE and not has_misfit:
         return Rejection("uncertain", f"by {largest_sigma_m:.2f} m along a curve: an ellipse would mislead")
     (horizontal_m, vertical_m, hidden_m), tests, worst = _test_parts(fit, covariance)
     warning = f"the points miss the sites by {math.sqrt(fit.cost / freedom):.1f} sigmas (rms)"
@@ -294,7 +294,7 @@ def _test_fault(
     left = np.eye(kept.sum()) - shared.T @ follow
     share, axes_left = np.linalg.eigh((left + left.T) / 2)
     rotated, shifts = basis @ axes_left, follow[:3] @ axes_left
-    redundant = share > _LEAST_REDUNDANCY
+    redundant = share > _MIN_REDUNDANCY
     value = float(((rotated.T @ side)[redundant] ** 2 / share[redundant]).sum())
     # An untested fault may be of any size, or as large as the bound allows.
     share = np.where(redundant, share, 1e-12)

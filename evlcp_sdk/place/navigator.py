@@ -115,7 +115,7 @@ _BLOCK = 1024
 acceleration of 1 m/s2 matters against fixes of centimetres."""
 
 
-_MOST_STANDING = 256
+_MAX_STANDING = 256
 """Parts whose standing errors are remembered; then the one not seen for longest is dropped."""
 
 _SUPPORT_US = 10e6
@@ -356,7 +356,7 @@ class Navigator:
             # Moves it to the end.
             self._standing.pop(cause.name, None)
             self._standing[cause.name] = point.standing(cause.name)  # type: ignore[assignment]
-        while len(self._standing) > _MOST_STANDING:
+        while len(self._standing) > _MAX_STANDING:
             del self._standing[next(iter(self._standing))]
         filtered = self._to_place(point)
         self._window.append((fix, point, filtered))

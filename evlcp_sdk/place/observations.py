@@ -56,7 +56,7 @@ _COLLINEAR_SHARE = 0.02
 """Bars whose centres lie within this share of their extent from a line are in line: beyond, the shape of a
 triangle of 10 m at 50 m is seen to better than a pixel, with a focal length of 7000 px."""
 
-_LEAST_ANGLE_RAD = 1e-7
+_MIN_ANGLE_RAD = 1e-7
 """Least sigma of an angle, so that exact knowledge stays solvable: 5 um at 50 m."""
 
 _IDENTITY = np.eye(2)
@@ -190,7 +190,7 @@ class KnownAngles(NamedTuple):
         pitch = math.radians(attitude.pitch_deg)
         by_vibration = [[1.0, 0.0], [0.0, math.tan(pitch)], [0.0, 1 / math.cos(pitch)]]
         moves = np.concatenate([causes, vibration_rad * np.array(by_vibration)], 1)
-        noise = math.radians(attitude.white_sigma_deg) ** 2 + _LEAST_ANGLE_RAD**2
+        noise = math.radians(attitude.white_sigma_deg) ** 2 + _MIN_ANGLE_RAD**2
         whitening = np.linalg.inv(np.linalg.cholesky(moves @ moves.T + noise * np.eye(3)))
         if known < 3:
             whitening[2] = (0.0, 0.0, 1.0)

@@ -35,10 +35,10 @@ correlated. From simulated drives, by night and by day, with a lens's wings and 
 _PIXEL_FREEDOM = 3
 """Degrees of freedom of the stated error within pixels; 16 points about a line have 13."""
 
-_LEAST_ACROSS = 0.1
+_MIN_ACROSS = 0.1
 """Least ratio of errors across a bar to those along it."""
 
-_LEAST_FREEDOM = 2
+_MIN_FREEDOM = 2
 """Degrees of freedom below which points do not show their errors."""
 
 _RANK_SHARE = 1e-6
@@ -137,7 +137,7 @@ def interpolate_points(
         misfit_px2, freedom = _misfit_across(points_px, layout_m)
         squares = _PIXEL_FREEDOM * pixel_px**2 + _NEIGHBOUR_FACTOR * misfit_px2
         error_px = max(scatter_across * stated_rms, math.sqrt(squares / (_PIXEL_FREEDOM + freedom)))
-        across = max(math.hypot(error_px, timing_px) / along, _LEAST_ACROSS if freedom else 1.0)
+        across = max(math.hypot(error_px, timing_px) / along, _MIN_ACROSS if freedom else 1.0)
     stretches = [f.range.standing_m / f.range.distance_m for f in nearby if f.range.standing_m]
     return BarView(
         transmitter,
@@ -170,7 +170,7 @@ def _misfit_across(points: Floats, layout_m: Floats) -> tuple[float, int]:
     modes, size, _ = np.linalg.svd(terms, full_matrices=False)
     modes = modes[:, size > _RANK_SHARE * size[0]]
     freedom = len(places) - modes.shape[1]
-    if freedom < _LEAST_FREEDOM:
+    if freedom < _MIN_FREEDOM:
         return 0.0, 0
     across = points @ np.array([-axis[1], axis[0]]) / np.linalg.norm(axis)
     residual = across - modes @ (modes.T @ across)

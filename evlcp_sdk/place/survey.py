@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.formatting import format_count
-from evlcp_sdk.place.calibration import MOST_MISFIT, CalibrationView, KnownPose, WhitenedView, solve_views
+from evlcp_sdk.place.calibration import MAX_MISFIT, CalibrationView, KnownPose, WhitenedView, solve_views
 from evlcp_sdk.place.error_model import DEFAULT_ERRORS, EXACT_CAMERA, ErrorModel
 from evlcp_sdk.place.navigator import Navigator, Placed, Settled
 from evlcp_sdk.scene.attitude import Attitude
@@ -25,7 +25,7 @@ from evlcp_sdk.values import Packet
 
 Floats = NDArray[np.float64]
 
-_MOST_POSES = 12
+_MAX_POSES = 12
 """Poses by which a bar is surveyed; with more, errors of the track repeat."""
 
 _PAUSE_US = 200_000.0
@@ -70,7 +70,7 @@ class TrackPoses:
         for number in self._find_new_bars():
             times = [t for t in self._poses if self._is_in_view(number, t)]
             if times:
-                rows = np.linspace(0, len(times) - 1, min(len(times), _MOST_POSES))
+                rows = np.linspace(0, len(times) - 1, min(len(times), _MAX_POSES))
                 selected |= {times[row] for row in rows.round().astype(int).tolist()}
         return [self._poses[t] for t in sorted(selected)]
 
@@ -122,7 +122,7 @@ class TrackPoses:
 _PLACE_M, _TURN_RAD = 100.0, 0.5
 """Prior sigmas of a bar's place and attitude about their start."""
 
-_MOST_PASSES, _SETTLED_RAD = 8, 1e-4
+_MAX_PASSES, _SETTLED_RAD = 8, 1e-4
 """Fits, each linear about the last one's attitudes, until these change by less."""
 
 
@@ -165,7 +165,7 @@ def survey_bars(
     ids = sorted({bar.transmitter for view in views for bar in view.bars})
     lengths_m = length_m if isinstance(length_m, Mapping) else dict.fromkeys(ids, length_m)
     lines = {id_: _estimate_start(views, id_, camera, lengths_m[id_]) for id_ in ids}
-    for _ in range(_MOST_PASSES):
+    for _ in range(_MAX_PASSES):
         placed = [_place_bars(view, lines, lengths_m) for view in views]
         whitened = [one for view in placed if (one := WhitenedView.of(view, camera, spec)) is not None]
         if not whitened:
@@ -182,7 +182,7 @@ def survey_bars(
             lines[id_] = centre + _PLACE_M * steps[:3], new_axis
         if change < _SETTLED_RAD:
             break
-    if solution.misfit > MOST_MISFIT:
+    if solution.misfit > MAX_MISFIT:
         raise ConfigError(
             f"the views miss one another by {math.sqrt(solution.misfit):.1f} sigmas (rms): a pose is wrong"
         )

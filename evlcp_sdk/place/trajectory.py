@@ -173,7 +173,7 @@ IMU's rates and accelerations."""
 _SPEED_M_S = 30.0
 """Prior sigma of the speed: a car's."""
 
-_MOST_REJECTED = 10
+_MAX_REJECTED = 10
 """Fixes in a row that are rejected before the trajectory starts anew: so many are not outliers. In a young
 one, no more than it has accepted: an outlier among its first fixes points it elsewhere."""
 
@@ -194,7 +194,7 @@ _COURSE_FIXES = 3
 _REFILTER_COUNTS = (4, 8, 16)
 """Fixes after which those since a course began are filtered again, each where the course has it by then."""
 
-_MOST_NOISE_SIGMAS = 3.0
+_MAX_NOISE_SIGMAS = 3.0
 """Sigmas of its noise that a fix may be off its course; more is not noise."""
 
 _NOISY_SHARE = 1e-3
@@ -245,7 +245,7 @@ class TrajectoryPoint:
         motion: The camera's motion since the point before.
         rejected: Fixes in a row that were rejected, up to this one; 0 where it counts.
         starts: A trajectory starts here.
-        accepted: Fixes that count since then, at most `_MOST_REJECTED`.
+        accepted: Fixes that count since then, at most `_MAX_REJECTED`.
         fix: The fix, accepted or rejected.
         course: The course of fixes of the same bars, with little of their noise.
         recent: The points from the one before that course on, as long as it is short.
@@ -314,7 +314,7 @@ def step_trajectory(
     spread = observation @ predicted.covariance @ observation.T + fix.noise_m2
     limit = chi_square(spec.false_alarm, 3) if fix.source == GNSS else spec.gate_sigmas**2
     if innovation @ np.linalg.solve(spread, innovation) > limit:
-        if state.rejected + 1 > min(_MOST_REJECTED, state.accepted):
+        if state.rejected + 1 > min(_MAX_REJECTED, state.accepted):
             return _start_trajectory(fix)
         return _refine_course(state, replace(_set_heading(predicted, fix), rejected=state.rejected + 1), spec)
     return _refine_course(state, _apply_fix(predicted, fix, observation), spec)
@@ -344,7 +344,7 @@ def _apply_fix(predicted: TrajectoryPoint, fix: Fix, observation: Floats) -> Tra
     after = predicted.covariance - change - change.T + gain @ spread @ gain.T
     mean = predicted.mean + gain @ (fix.enu_m - observation @ predicted.mean)
     after = (after + after.T) / 2
-    accepted = min(predicted.accepted + 1, _MOST_REJECTED)
+    accepted = min(predicted.accepted + 1, _MAX_REJECTED)
     return replace(_set_heading(predicted, fix), mean=mean, covariance=after, rejected=0, accepted=accepted)
 
 
@@ -484,7 +484,7 @@ def _observe_on_course(predicted: TrajectoryPoint, fix: Fix) -> tuple[Trajectory
     if count < _COURSE_FIXES:
         offset_m = fix.enu_m - course.place_m
     sigmas = math.sqrt(float(offset_m @ np.linalg.solve(fix.noise_m2 + fix.slow_m2, offset_m)))
-    offset_m = offset_m * min(1.0, _MOST_NOISE_SIGMAS / max(sigmas, 1e-9))
+    offset_m = offset_m * min(1.0, _MAX_NOISE_SIGMAS / max(sigmas, 1e-9))
     observation = _observation_matrix(predicted.causes, _shift_standing(fix, offset_m))
     return replace(predicted, course=course), observation
 

@@ -386,7 +386,7 @@ class Role:
         return self.default_unpaired if unpaired_codes and self.default_unpaired is not None else self.default
 
 
-_MOST_RELATIVE_WIDTH = 2.0
+_MAX_RELATIVE_WIDTH = 2.0
 """Widest layout, in heights of its columns, whose columns measure the distance better than its width."""
 
 
@@ -395,7 +395,7 @@ def _choose_ranging(bar: BarLayout, unpaired_codes: Collection[str]) -> str:
         return "none"
     # `joint-scale` ignores the width, which matters most for low columns far apart.
     high_m = max((len(clusters) * pitch_m for clusters, pitch_m in bar.even_columns), default=0.0)
-    if "pilots" not in unpaired_codes and high_m > 0 and bar.width_m <= _MOST_RELATIVE_WIDTH * high_m:
+    if "pilots" not in unpaired_codes and high_m > 0 and bar.width_m <= _MAX_RELATIVE_WIDTH * high_m:
         return "joint-scale"
     usual = int(bar.has_usual_sides.sum())
     if usual >= 2 and bar.has_equal_clusters:

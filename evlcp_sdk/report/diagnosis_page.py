@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.diagnosis.diagnose import Diagnosis
 from evlcp_sdk.report.pages import render_page
 
-_MOST_SOURCES = 40
+_MAX_SOURCES = 40
 
 _MARKS = {
     "pass": ("yes", "ok"),
@@ -26,7 +26,7 @@ def render_diagnosis(diagnosis: Diagnosis) -> str:
     """Render the page as HTML."""
     name = Path(diagnosis.recording).name
     height, width = (n * diagnosis.cell_px for n in diagnosis.frequency_hz.shape)
-    shown = diagnosis.sources[:_MOST_SOURCES]
+    shown = diagnosis.sources[:_MAX_SOURCES]
     sources = [(n, *one.table_cells().values(), f"{one.strength:.2f}") for n, one in enumerate(shown, 1)]
     trials = [
         (
@@ -48,7 +48,7 @@ def render_diagnosis(diagnosis: Diagnosis) -> str:
         frequency_png=_encode_png(_draw_frequencies(diagnosis.frequency_hz)),
         width=width,
         height=height,
-        most=_MOST_SOURCES,
+        most=_MAX_SOURCES,
         heads=["", *shown[0].table_cells(), "certainty"] if shown else [],
         sources=sources,
         trials=trials,

@@ -33,8 +33,8 @@ from evlcp_sdk.results.sink import Run
 from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 _DPI = 150
-_MOST_TRANSMITTERS = 3
-_MOST_BOXES, _MOST_REGIONS = 1024, 64
+_MAX_TRANSMITTERS = 3
+_MAX_BOXES, _MAX_REGIONS = 1024, 64
 """Boxes of a region, and regions, that are kept."""
 
 
@@ -75,16 +75,16 @@ class Figures(ChartSink):
             self._presence = value
         elif stage == "frame" and self._presence is not None:
             best = self.clearest.get(value.transmitter)
-            has_room = best is None and len(self.clearest) < _MOST_TRANSMITTERS
+            has_room = best is None and len(self.clearest) < _MAX_TRANSMITTERS
             if has_room or (best is not None and value.soft.quality > best[0].soft.quality):
                 self.clearest[value.transmitter] = value, self._presence
 
     def _add_region(self, region: Region) -> None:
         if region.id not in self.regions:
             self.region_count += 1
-            if len(self.regions) == _MOST_REGIONS:
+            if len(self.regions) == _MAX_REGIONS:
                 del self.regions[min(self.regions, key=lambda number: len(self.regions[number]))]
-            self.regions[region.id] = EvenSample(_MOST_BOXES)
+            self.regions[region.id] = EvenSample(_MAX_BOXES)
         self.regions[region.id].add(region)
 
     def finish(self) -> Mapping[str, Any]:
@@ -216,7 +216,7 @@ def _draw_frame_presence(part: SubFigure, frame: Frame, presence: PresenceMap, w
 def draw_distance(kept: Figures, title: str) -> Figure:
     """Draw distance and its deviation from neighbours of each transmitter, and quality, over time."""
     axis = seconds_axis(kept.first_us or 0)
-    frames = dict([*kept.frames().items()][:_MOST_TRANSMITTERS])
+    frames = dict([*kept.frames().items()][:_MAX_TRANSMITTERS])
     plots = [plot for number, one in frames.items() for plot in plot_distances(number, *one, axis)]
     return draw_plots([*plots, plot_quality(frames, axis)], f"{title}: distance along the optical axis")
 

@@ -27,7 +27,7 @@ FilmKind = Literal["WEBP", "GIF", "MP4"]
 FILM_KINDS: Mapping[str, FilmKind] = {".webp": "WEBP", ".gif": "GIF", ".mp4": "MP4"}
 """Format of a film by the suffix of its file."""
 
-MOST_PICTURES, MOST_MEGAPIXELS = 500, 160
+MAX_PICTURES, MAX_MEGAPIXELS = 500, 160
 """Largest number of a film's pictures, and of pixels in all of them, which are held until it is written, a
 byte each."""
 
@@ -36,12 +36,12 @@ PICTURES_PER_S = 25
 
 _DARK, _ON, _OFF = np.array([16, 16, 20]), np.array([255, 205, 70]), np.array([70, 150, 255])
 _INK, _DIM = (235, 235, 235), (150, 150, 150)
-_MOST_SCALE = 8.0
+_MAX_SCALE = 8.0
 
 _TEXT_PX = 13
 _HEAD_PX = 20
 _COLOURS = 128
-_MOST_KEPT = 20_000
+_MAX_KEPT = 20_000
 """Frames, and regions, the newest, that are kept while a recording is decoded."""
 
 _DELAY_PACKETS = 3
@@ -120,9 +120,9 @@ def check_film(out: Path, for_ms: float, slow: float) -> FilmKind:
         raise ConfigError(f"{out}: a film is written as {' or '.join(f'NAME{end}' for end in FILM_KINDS)}")
     if kind == "MP4" and find_spec("av") is None:
         raise ConfigError("films as .mp4 need the extra: pip install 'evlcp-sdk[mp4]'")
-    if (pictures := count_pictures(for_ms, slow)) > MOST_PICTURES:
+    if (pictures := count_pictures(for_ms, slow)) > MAX_PICTURES:
         raise ConfigError(
-            f"{for_ms:g} ms at 1/{slow:g} would be {pictures} pictures, at most {MOST_PICTURES}: show less,"
+            f"{for_ms:g} ms at 1/{slow:g} would be {pictures} pictures, at most {MAX_PICTURES}: show less,"
             " or faster"
         )
     return kind
@@ -132,7 +132,7 @@ class _RegionCollector:
     """Keeps the newest regions that a receiver follows."""
 
     def __init__(self) -> None:
-        self.regions: deque[Region] = deque(maxlen=_MOST_KEPT)
+        self.regions: deque[Region] = deque(maxlen=_MAX_KEPT)
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
@@ -158,7 +158,7 @@ def gather_footage(
     Raises:
         InputError: The recording has nothing there.
     """
-    probe, frames = _RegionCollector(), deque[Frame](maxlen=_MOST_KEPT)
+    probe, frames = _RegionCollector(), deque[Frame](maxlen=_MAX_KEPT)
     first_us = last_us = start_us = math.nan
     # With several links, packets of one wait for the others.
     delay_us = _DELAY_PACKETS * min(len(links), 2) * max(one.packet.packet_us for one in links.values())
@@ -215,14 +215,14 @@ def plan_film(
         rows = max(rows, 0.4 * columns)
         left, right = _clamp_range(float(middle[0]), float(columns), camera.width)
         top, bottom = _clamp_range(float(middle[1]), float(rows), camera.height)
-    scale = min(longest_px / max(right - left, bottom - top), _MOST_SCALE)
+    scale = min(longest_px / max(right - left, bottom - top), _MAX_SCALE)
     pictures = count_pictures(for_us * 1e-3, slow)
     film = Film(footage.start_us, pictures, left, top, right - left, bottom - top, scale, slow)
     width, height = film.size_px
-    if (megapixels := pictures * width * height * 1e-6) > MOST_MEGAPIXELS:
+    if (megapixels := pictures * width * height * 1e-6) > MAX_MEGAPIXELS:
         raise ConfigError(
             f"{pictures} pictures of {width} x {height} px are {megapixels:.0f} megapixels, at most"
-            f" {MOST_MEGAPIXELS}: smaller, shorter, or faster"
+            f" {MAX_MEGAPIXELS}: smaller, shorter, or faster"
         )
     return film
 

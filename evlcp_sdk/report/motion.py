@@ -13,10 +13,10 @@ from evlcp_sdk.report.colours import cluster_hex
 from evlcp_sdk.values import Frame, FrameView, PresenceMap
 
 _MARGIN_PX = 3
-_MOST_EVENTS = 4
+_MAX_EVENTS = 4
 """Events of one polarity of a pixel in a chip; more look no brighter."""
 
-_MOST_CELLS = 250_000
+_MAX_CELLS = 250_000
 """Chips times pixels of a picture; in a larger one, pixels are binned."""
 
 _NO_CLUSTER = -1
@@ -48,13 +48,13 @@ class Motion:
             clusters, sums = clusters[crop], view.sums[:, *crop]
         else:
             sums = view.sums
-        step = int(np.ceil(np.sqrt(sums.size / _MOST_CELLS)))
+        step = int(np.ceil(np.sqrt(sums.size / _MAX_CELLS)))
         if step > 1:
             edges = [np.arange(0, size, step) for size in clusters.shape]
             sums = np.add.reduceat(np.add.reduceat(sums, edges[0], axis=1), edges[1], axis=2)
             clusters = clusters[step // 2 :: step, step // 2 :: step]
             sums = sums[:, : clusters.shape[0], : clusters.shape[1]]
-        clipped = np.clip(sums, -_MOST_EVENTS, _MOST_EVENTS).astype(np.int8)
+        clipped = np.clip(sums, -_MAX_EVENTS, _MAX_EVENTS).astype(np.int8)
         return cls(frame, clipped, clusters.copy())
 
     def to_dict(self, codebook: Codebook, chip_us: float, ms: Callable[[float], float]) -> dict[str, Any]:
@@ -73,7 +73,7 @@ class Motion:
             "name": f"transmitter {self.frame.transmitter}, packet {self.frame.packet},"
             f" frame {self.frame.frame}",
             # A letter a pixel: e is none, f to i are positive events, d to a negative ones.
-            "events": (self.sums + (ord("a") + _MOST_EVENTS)).astype(np.uint8).tobytes().decode("ascii"),
+            "events": (self.sums + (ord("a") + _MAX_EVENTS)).astype(np.uint8).tobytes().decode("ascii"),
             "clusters": self.clusters.ravel().tolist(),
             "lit": ["".join("?01"[value + 1] for value in row) for row in lit.tolist()],
             "symbols": [s if s >= 0 else None for s in self.frame.soft.symbols.tolist()],

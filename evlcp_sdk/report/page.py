@@ -32,8 +32,8 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.values import Frame, Packet, ReceivedMessage
 
-_MOST_MESSAGES = 50
-_MOST_TEXT = 2_000
+_MAX_MESSAGES = 50
+_MAX_TEXT = 2_000
 
 _LONG_S = 5.0
 """Duration of a recording from which on its charts are in seconds."""
@@ -46,7 +46,7 @@ class Report(ChartSink):
         super().__init__(folder, run)
         self._motion = MotionCollector(3 * max(len(run.links), 1))
         self._messages: list[ReceivedMessage] = []
-        self._latest: deque[ReceivedMessage] = deque(maxlen=_MOST_MESSAGES)
+        self._latest: deque[ReceivedMessage] = deque(maxlen=_MAX_MESSAGES)
         self._message_count = 0
 
     @hookimpl
@@ -59,7 +59,7 @@ class Report(ChartSink):
         super().packet(packet)
         for message in packet.messages:
             self._message_count += 1
-            (self._messages if len(self._messages) < _MOST_MESSAGES else self._latest).append(message)
+            (self._messages if len(self._messages) < _MAX_MESSAGES else self._latest).append(message)
 
     def conclude(self, summary: Mapping[str, Any]) -> None:
         """Write the page, the same for the same recording."""
@@ -109,7 +109,7 @@ class Report(ChartSink):
                     m.kind.name,
                     m.message.transmitter_id,
                     m.trust,
-                    m.summary(_MOST_TEXT),
+                    m.summary(_MAX_TEXT),
                 )
                 for m in messages
             ],

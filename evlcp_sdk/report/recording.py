@@ -15,9 +15,9 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Events, Fix, Frame, Packet, sigmas
 
-_MOST_TRANSMITTERS, _MOST_FRAMES, _MOST_POSITIONS = 6, 512, 1024
-_MOST_ROWS = 40
-_MOST_ELLIPSES = 40
+_MAX_TRANSMITTERS, _MAX_FRAMES, _MAX_POSITIONS = 6, 512, 1024
+_MAX_ROWS = 40
+_MAX_ELLIPSES = 40
 _FIX = "#56b4e9"
 
 T = TypeVar("T")
@@ -70,7 +70,7 @@ class TransmitterFrames:
 
     link: str
     echo_of: int | None = None
-    frames: EvenSample[Frame] = field(default_factory=lambda: EvenSample(_MOST_FRAMES))
+    frames: EvenSample[Frame] = field(default_factory=lambda: EvenSample(_MAX_FRAMES))
     first: list[Frame] = field(default_factory=list)
     count: int = 0
 
@@ -88,7 +88,7 @@ class ChartSink(Sink):
         super().__init__(folder, run)
         self.first_us: int | None = None
         self.transmitters: dict[int, TransmitterFrames] = {}
-        self.track = EvenSample[Settled](_MOST_POSITIONS)
+        self.track = EvenSample[Settled](_MAX_POSITIONS)
 
     def events(self, events: Events) -> None:
         """Store the recording's start."""
@@ -98,10 +98,10 @@ class ChartSink(Sink):
     def packet(self, packet: Packet) -> None:
         """Keep frames."""
         number = packet.transmitter
-        if packet.frames and (number in self.transmitters or len(self.transmitters) < _MOST_TRANSMITTERS):
+        if packet.frames and (number in self.transmitters or len(self.transmitters) < _MAX_TRANSMITTERS):
             kept = self.transmitters.setdefault(number, TransmitterFrames(packet.link))
             kept.echo_of = packet.echo_of
-            kept.first += packet.frames[: _MOST_ROWS - len(kept.first)]
+            kept.first += packet.frames[: _MAX_ROWS - len(kept.first)]
             kept.count += len(packet.frames)
             for frame in packet.frames:
                 kept.frames.add(frame)
@@ -231,7 +231,7 @@ def _plot_maps(
     if points:
         fixes = [point.fix for point in points]
         fixed = np.array([fix.enu_m for fix in fixes])
-        selected = fixes[:: max(1, -(-len(fixes) // _MOST_ELLIPSES))]
+        selected = fixes[:: max(1, -(-len(fixes) // _MAX_ELLIPSES))]
         scale = choose_ellipse_scale([fix.covariance_m2 for fix in selected], fixed)
         name = "95 % ellipse" + (f", {scale} times as large" if scale > 1 else "")
         for fix in selected:

@@ -17,7 +17,7 @@ Columns = tuple[Array, Array, Array, Array]
 # A pixel's state, uint32, from the lowest bit on: score, kind of its newest time, repetitions, clock.
 TIME_BIT, REPEATS_BIT, CLOCK_BIT = 6, 10, 15
 
-SCORE_MASK, MOST_REPEATS = 63, 31
+SCORE_MASK, MAX_REPEATS = 63, 31
 
 CLOCK_TICKS = 1 << 32 - CLOCK_BIT
 """Ticks after which the clock of 17 bits goes round."""
@@ -29,7 +29,7 @@ _CLOCK_SHIFT, _TICK_MASK = np.uint32(CLOCK_BIT), np.uint32(CLOCK_TICKS - 1)
 _CLOCK_MASK = np.uint32((1 << 32) - (1 << CLOCK_BIT))
 _BELOW_CLOCK, _BELOW_REPEATS = np.uint32((1 << CLOCK_BIT) - 1), np.uint32((1 << REPEATS_BIT) - 1)
 
-_REPEATS = np.add.outer([-6, 1, -2, 2], np.arange(MOST_REPEATS + 1)).clip(0, MOST_REPEATS).astype(np.uint32)
+_REPEATS = np.add.outer([-6, 1, -2, 2], np.arange(MAX_REPEATS + 1)).clip(0, MAX_REPEATS).astype(np.uint32)
 """Repetitions after each kind of time and number of them before. A kind counts by the logarithm of how much
 likelier it is of a lamp that misses one rise in ten than of the code of a cluster whose pilot repeats itself,
 in units of that of a repetition, a third."""
@@ -37,7 +37,7 @@ in units of that of a repetition, a third."""
 _BLOCK = 32
 """Events that are compared together: of a bar alone in the dark, every other block has no stray in it."""
 
-_MOST_HITS = np.int16(2**15 - 1)
+_MAX_HITS = np.int16(2**15 - 1)
 """Hits of a cell, two bytes, count no further: with chips below 3 us there may be more in a step."""
 
 
@@ -111,14 +111,14 @@ def score_rises(
         state = states[at]
         kind = np.uint32(kinds[runs[i]])
         low = np.uint32(transitions[(kind << np.uint32(REPEATS_BIT)) | (state & _BELOW_REPEATS)])
-        same = (state >> np.uint32(REPEATS_BIT)) & np.uint32(MOST_REPEATS)
+        same = (state >> np.uint32(REPEATS_BIT)) & np.uint32(MAX_REPEATS)
         same = _REPEATS[low >> np.uint32(REPEATS_BIT), same]
         states[at] = (state & _CLOCK_MASK) | (same << np.uint32(REPEATS_BIT)) | (low & _BELOW_REPEATS)
         # A rise after a long time is no blinking yet, however a pixel blinked when a bar was there.
         if (low & np.uint32(SCORE_MASK)) >= least and kind != np.uint32(0) and same < lamp:
             row = at // width
             cell = (row >> shift) * columns + ((at - row * width) >> shift)
-            cells[cell] += np.int16(cells[cell] < _MOST_HITS)
+            cells[cell] += np.int16(cells[cell] < _MAX_HITS)
             candidates += 1
     return candidates
 
@@ -333,7 +333,7 @@ def select_box(events: Columns, box: tuple[int, int, int, int], out: Columns) ->
     return int(np.int64(n))
 
 
-MOST_BOXES = 16
+MAX_BOXES = 16
 """Boxes that are served in one pass: a bit each."""
 
 _LOWEST = np.array([8, *((n & -n).bit_length() - 1 for n in range(1, 1 << 8))], np.uint8)
@@ -354,7 +354,7 @@ def select_boxes(
 
     Args:
         events: Those of a step.
-        boxes: (left, top, right, bottom), int64 (n, 4), `MOST_BOXES` at the most.
+        boxes: (left, top, right, bottom), int64 (n, 4), `MAX_BOXES` at the most.
         pixels: States, uint32 (height, width).
         rhythmic: (boxes of which only pixels in rhythm count, a bit each; the least score of these;
             repetitions of a time from which on they do not count).
@@ -373,14 +373,14 @@ def select_boxes(
             columns[u] |= np.uint16(1 << k)
         for v in range(top, bottom):
             rows[v] |= np.uint16(1 << k)
-    ends = np.empty(MOST_BOXES + 1, np.int64)
+    ends = np.empty(MAX_BOXES + 1, np.int64)
     for k in range(ends.size):
         ends[k] = min(k, len(boxes)) * stride
     for i in range(t_us.size):
         inside = columns[x[i]] & rows[y[i]]
         if inside & filtered:
             state = pixels[y[i], x[i]]
-            same = (state >> np.uint32(REPEATS_BIT)) & np.uint32(MOST_REPEATS)
+            same = (state >> np.uint32(REPEATS_BIT)) & np.uint32(MAX_REPEATS)
             is_rhythmic = ((state & np.uint32(SCORE_MASK)) >= least) & (same < most_repeats)
             inside = inside if is_rhythmic else np.uint16(inside & ~filtered)
         while True:

@@ -19,7 +19,7 @@ from evlcp_sdk.rx.trust import BeaconVerifier, TrustVerdict, describe_signature
 from evlcp_sdk.utc import ClockZero, clock_zero_at
 from evlcp_sdk.values import Packet, ReceivedMessage, replace_fields
 
-_LLR_POWER, _MOST_LLR = 0.5, 7.0
+_LLR_POWER, _MAX_LLR = 0.5, 7.0
 """Power that magnitudes of LLRs are raised to, as decoders are overconfident within a burst, and their limit
 after that: no bit is surer than the sync that it depends on, which is wrong once in a thousand."""
 
@@ -27,10 +27,10 @@ _SAME_BLOCK_SIGMA = 6.0
 """Agreement of two packets' soft bits from which on they carry the same block: by chance once in 1e9
 pairs."""
 
-_MOST_TRANSMITTERS = 16
+_MAX_TRANSMITTERS = 16
 """Transmitters whose messages are collected: those received last."""
 
-_MOST_MESSAGES = 8
+_MAX_MESSAGES = 8
 """Messages of a transmitter that are collected at a time, and complete ones that are remembered."""
 
 _COUNTS = (
@@ -149,7 +149,7 @@ class MessageAssembler:
             return packet
         inbox = self._inboxes.setdefault(packet.transmitter, _Inbox())
         self._inboxes.move_to_end(packet.transmitter)
-        while len(self._inboxes) > _MOST_TRANSMITTERS:
+        while len(self._inboxes) > _MAX_TRANSMITTERS:
             self._count_missing(self._inboxes.popitem(last=False)[1].incomplete.values())
         self.counts["blocks_tried"] += 1
         content, packets = self._decode_packet(inbox, self._calibrate_llr(packet))
@@ -180,7 +180,7 @@ class MessageAssembler:
         for frame in packet.frames:
             llr[frame.frame] = frame.soft.llr.ravel()
         llr[np.isnan(llr)] = 0
-        magnitude = np.minimum(np.abs(llr) ** _LLR_POWER, _MOST_LLR)
+        magnitude = np.minimum(np.abs(llr) ** _LLR_POWER, _MAX_LLR)
         return np.copysign(magnitude, llr).ravel()
 
     def _decode_packet(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:
@@ -226,7 +226,7 @@ class MessageAssembler:
         partial = inbox.incomplete.setdefault(key, _PartialMessage(block.length, total))
         inbox.incomplete.move_to_end(key)
         partial.parts[block.index] = block.part
-        while len(inbox.incomplete) > _MOST_MESSAGES:
+        while len(inbox.incomplete) > _MAX_MESSAGES:
             self._count_missing([inbox.incomplete.popitem(last=False)[1]])
         if sum(map(len, partial.parts.values())) != partial.total:
             return []
@@ -238,7 +238,7 @@ class MessageAssembler:
             partial.parts = {block.index: block.part}
             return []
         inbox.complete[key] = inbox.incomplete.pop(key)
-        while len(inbox.complete) > _MOST_MESSAGES:
+        while len(inbox.complete) > _MAX_MESSAGES:
             inbox.complete.popitem(last=False)
         return self._deliver(inbox, key, packet)
 

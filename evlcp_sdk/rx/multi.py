@@ -29,10 +29,10 @@ _OWNER_WEIGHT = 2.0
 _OWNER_SHARE = 0.5
 """Share of the light that a packet explains from which on its transmitter owns its place."""
 
-_MOST_TRANSMITTERS = 1024
+_MAX_TRANSMITTERS = 1024
 """Transmitters whose last places are known."""
 
-_MOST_FRAMES = 4096
+_MAX_FRAMES = 4096
 """Frames that wait at a time; of more, the oldest are decided early."""
 
 
@@ -114,7 +114,7 @@ class LinkArbiter:
         for number, place in places.items():
             self._last_places.pop(number, None)
             self._last_places[number] = place
-        while len(self._last_places) > _MOST_TRANSMITTERS:
+        while len(self._last_places) > _MAX_TRANSMITTERS:
             number = next(iter(self._last_places))
             del self._last_places[number]
             self.owners.discard(number)
@@ -132,7 +132,7 @@ class LinkArbiter:
 
     def decide(self, now_us: float) -> Iterator[tuple[PacketCandidate, bool]]:
         """Yield the packets that have waited long enough, and whether they fit."""
-        while self._waiting and (self._waiting[0].decide_us <= now_us or self._frames > _MOST_FRAMES):
+        while self._waiting and (self._waiting[0].decide_us <= now_us or self._frames > _MAX_FRAMES):
             candidate = self._waiting[0]
             fits = self._find_best_link(candidate) == candidate.link
             self._frames -= len(candidate.packet.frames)
@@ -141,7 +141,7 @@ class LinkArbiter:
             (self.owners.add if owns else self.owners.discard)(candidate.packet.transmitter)
             yield candidate, fits
         oldest_us = now_us - 2 * self._wait_us - self._longest_us
-        while self._decided and (self._decided[0].decide_us < oldest_us or len(self._decided) > _MOST_FRAMES):
+        while self._decided and (self._decided[0].decide_us < oldest_us or len(self._decided) > _MAX_FRAMES):
             self._decided.popleft()
 
     def _find_best_link(self, candidate: PacketCandidate) -> int:
@@ -221,10 +221,10 @@ class FrameReporter:
         """Add the next frame of a transmitter, which owns its place now or not."""
         frames = self._frames.setdefault(frame.transmitter, OrderedDict())
         frames[frame.packet, frame.frame] = frame
-        if len(frames) > _MOST_FRAMES:
+        if len(frames) > _MAX_FRAMES:
             frames.popitem(last=False)
         self._frames.move_to_end(frame.transmitter)
-        if len(self._frames) > _MOST_TRANSMITTERS:
+        if len(self._frames) > _MAX_TRANSMITTERS:
             self._frames.popitem(last=False)
         if owns_place:
             self._report_waiting(frame.transmitter)

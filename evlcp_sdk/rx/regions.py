@@ -55,7 +55,7 @@ SAME_PX = 5.0
 _HEIGHTS = 9
 """Measured heights whose median is a region's: a bar ahead grows by a percent in so many steps at 80 km/h."""
 
-_MOST_AHEAD_STEPS = 2
+_MAX_AHEAD_STEPS = 2
 """Steps by which a track is extrapolated: then a shaking camera turns."""
 
 _CAPACITY = 64
@@ -170,7 +170,7 @@ class RegionTrack:
         Interpolated; extrapolated for a little.
         """
         centre = np.empty((2, len(times)))
-        _kernels.interpolate_centres(times, start_us, unit_us, self._samples(), _MOST_AHEAD_STEPS, centre)
+        _kernels.interpolate_centres(times, start_us, unit_us, self._samples(), _MAX_AHEAD_STEPS, centre)
         return centre
 
     def centre_at(self, t_us: float) -> tuple[float, float]:
@@ -186,7 +186,7 @@ class RegionTrack:
         span_us = to_us - from_us
         is_late = t_us > to_us
         after_us = t_us - (to_us if is_late else from_us)
-        after_us = min(max(after_us, -_MOST_AHEAD_STEPS * span_us), _MOST_AHEAD_STEPS * span_us)
+        after_us = min(max(after_us, -_MAX_AHEAD_STEPS * span_us), _MAX_AHEAD_STEPS * span_us)
         x_px = (to_x if is_late else from_x) + (to_x - from_x) / span_us * after_us
         return x_px, (to_y if is_late else from_y) + (to_y - from_y) / span_us * after_us
 
@@ -409,7 +409,7 @@ class RegionTracker(ABC):
                     region.forgotten_until_us = region.first_us = oldest_us + step_us
 
 
-_LEAST_RISES = 20
+_MIN_RISES = 20
 """Rises of candidate pixels in a step that a new region needs: a cluster at 100 m has as many, noise few."""
 
 _MEASURE_GAPS = 1.5
@@ -420,7 +420,7 @@ _LATENCY_CHIPS = 5
 some six chips late and more where events go missing; its trailing end stays for the six chips of the
 measurement. In recordings and simulated scenes the centre is 3 to 8 chips late."""
 
-_MOST_RECENT_US = 200_000
+_MAX_RECENT_US = 200_000
 """Longest time for which events of the whole image are kept, to gather those of a region again: a packet that
 is longer starts with the frames in reach."""
 
@@ -435,7 +435,7 @@ _CALM, _FLOODED, _FLOOD_STEPS = 0.25, 0.5, 3
 after that, all light changes, and pixels that the bar has left would drag its region along. That may last so
 many steps; what goes on, a halo, is no change. Leaves make 0.45 at the most."""
 
-_LEAST_SWEEP_EVENTS, _SWEEP_STEPS = 300, 4
+_MIN_SWEEP_EVENTS, _SWEEP_STEPS = 300, 4
 """Events outside all regions from which on sweeping bars are sought; and steps whose events such a bar has
 when it is found: two showed it, and it moved alike before."""
 
@@ -496,7 +496,7 @@ class RhythmTracker(RegionTracker):
         self._new_boxes: list[Box] = []
         self._sweeps: list[Sweep] = []
         self._recent: deque[Piece] = deque()
-        self._most_recent = max(math.ceil(min(keep_us, _MOST_RECENT_US) / spec.step_us), BACKFILL_STEPS)
+        self._most_recent = max(math.ceil(min(keep_us, _MAX_RECENT_US) / spec.step_us), BACKFILL_STEPS)
         self._recent_bytes = 0
         self._next_id = 0
         self.alive: list[TrackedRegion] = []
@@ -523,7 +523,7 @@ class RhythmTracker(RegionTracker):
         self._merge_overlapping()
         self._limit_memory(self._limits.region_bytes, spec.step_us)
         self._open_regions(end_us, rises, occupied)
-        if outside >= _LEAST_SWEEP_EVENTS and all(
+        if outside >= _MIN_SWEEP_EVENTS and all(
             one.velocity_px_us != STILL or one.size_px is None for one in self.alive
         ):
             self._open_sweeping(start_us, events, occupied)
@@ -873,7 +873,7 @@ class RhythmTracker(RegionTracker):
         `rises` is the number of hits in the step that ends at `end_us`.
         """
         hits, merge_px = self._hits, self._spec.merge_px
-        if rises >= _LEAST_RISES and (self.alive or occupied):
+        if rises >= _MIN_RISES and (self.alive or occupied):
             known = [
                 self._search_box(place.x_px, place.y_px, place.width_px, place.height_px)
                 for place in occupied
@@ -886,12 +886,12 @@ class RhythmTracker(RegionTracker):
                     known.append(self._search_box(*_initial_place(region)))
             rises -= _kernels.clear_cells(hits, np.array(known, np.int64), CELL_SHIFT)
         before, self._new_boxes, boxes = self._new_boxes, [], []
-        if rises >= _LEAST_RISES:
+        if rises >= _MIN_RISES:
             areas, left_out = find_areas(hits, self._limits.areas, self._sensor_px)
             self.counts["areas_left_out"] += left_out
             places = [self._measure_place(None, area, end_us) for area in areas]
             lit = [box_around(*place) for place in places if place is not None]
-            boxes = [box for box in join_boxes(lit, merge_px) if count_hits(hits, box) >= _LEAST_RISES]
+            boxes = [box for box in join_boxes(lit, merge_px) if count_hits(hits, box) >= _MIN_RISES]
         if rises:
             hits[:] = 0
         for box in boxes:

@@ -33,13 +33,13 @@ from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.boxes import Box
 from evlcp_sdk.values import Events
 
-_MOST_SCORE = 40
+_MAX_SCORE = 40
 """Limit of scores, so that a long rhythm is forgotten after so many rises off it."""
 
-_LEAST_CHIPS = 1.5
+_MIN_CHIPS = 1.5
 """Least time between rises in any code; sooner events are of the same rise."""
 
-_MOST_CHIPS = 15
+_MAX_CHIPS = 15
 """Longest time that counts, as does none beyond three times the longest gap of the code: events were
 missed."""
 
@@ -93,7 +93,7 @@ class BlinkTables:
     @lru_cache(maxsize=4)
     def of(cls, chip_us: float, gap_chips: int) -> "BlinkTables":
         """Tables for a length of chips, us, and the longest time from rise to rise in the codes, chips."""
-        late_us = (min(3 * gap_chips, _MOST_CHIPS) + 0.5) * chip_us
+        late_us = (min(3 * gap_chips, _MAX_CHIPS) + 0.5) * chip_us
         shift = max(math.ceil(math.log2(late_us / _LONGEST_TICKS)), 0)
         tick_us = 1 << shift
         run_us = np.arange(int(late_us) // tick_us + 2) * float(tick_us)
@@ -102,7 +102,7 @@ class BlinkTables:
         kinds = 1 + np.searchsorted((middles[1:] + middles[:-1]) / 2 * chip_us, run_us, side="right")
         kinds += _OFF_CHIPS * (np.abs(run_us - chips * chip_us) > _JITTER_CHIPS * chip_us)
         kinds[run_us > late_us] = _LATE
-        least_ticks = int(_LEAST_CHIPS * chip_us) >> shift
+        least_ticks = int(_MIN_CHIPS * chip_us) >> shift
         return cls(shift, least_ticks, kinds.astype(np.uint8), _build_transitions(gap_chips))
 
 
@@ -117,7 +117,7 @@ def _build_transitions(gap_chips: int) -> NDArray[np.uint16]:
     change = np.where(chips < gap_chips + 1, 2, np.where(time == before, -2, 1))
     change[kind >= _OFF_CHIPS] = -3
     change[kind == _LATE] = -1
-    low = (time << _kernels.TIME_BIT) | np.clip(score + change, 0, _MOST_SCORE)
+    low = (time << _kernels.TIME_BIT) | np.clip(score + change, 0, _MAX_SCORE)
     return np.asarray((_relate_times()[before, time] << _kernels.REPEATS_BIT) | low, np.uint16).ravel()
 
 
@@ -127,7 +127,7 @@ def _relate_times() -> NDArray[np.int64]:
     One may be two or three times the other, of which rises in between were missed.
     """
     relations = np.full((16, 16), _kernels.OTHER_TIME)
-    ends = [_LEAST_CHIPS, *((a + b) / 2 for a, b in pairwise(_TIMES)), _TIMES[-1] + 0.5]
+    ends = [_MIN_CHIPS, *((a + b) / 2 for a, b in pairwise(_TIMES)), _TIMES[-1] + 0.5]
     for shorter in range(1, len(_TIMES) + 1):
         same = _kernels.LONG_SAME_TIME if shorter >= _FIRST_LONG else _kernels.SAME_TIME
         for longer in range(shorter, len(_TIMES) + 1):
@@ -236,7 +236,7 @@ class BlinkDetector:
             rhythmic: Boxes of which only candidates' events are selected that are no lamps.
             most_repeats: Repetitions of a time from which on a candidate is a lamp.
         """
-        most = _kernels.MOST_BOXES
+        most = _kernels.MAX_BOXES
         if len(boxes) > most:
             first = self.select(events, boxes[:most], rhythmic[:most], most_repeats)
             return first + self.select(events, boxes[most:], rhythmic[most:], most_repeats)

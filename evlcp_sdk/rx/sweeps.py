@@ -19,10 +19,10 @@ FAST_PX_US = 2e-3
 """Speed across itself from which on a bar sweeps: its image, some 3 px wide, is on a pixel for 15 chips, too
 few for the score of a candidate."""
 
-_MOST_EVENTS = 1000
+_MAX_EVENTS = 1000
 """Events of a step, evenly sampled, that are enough: the place is good to a twentieth of a pixel."""
 
-_LEAST_EVENTS, _LEAST_SAMPLES = 200, 50
+_MIN_EVENTS, _MIN_SAMPLES = 200, 50
 """Events of a step that a sweep needs, and samples of them; a bar at 150 m has a few thousand events."""
 
 _ROUNDS, _OUTLIER = 3, 3.0
@@ -31,21 +31,21 @@ _ROUNDS, _OUTLIER = 3, 3.0
 _WIDEST_PX = 5.0
 """Sigma of a bar's events across it: 1.5 px at 40 m, 4 px out of focus at 18 m."""
 
-_LEAST_SHARE = 0.6
+_MIN_SHARE = 0.6
 """Share of the events that lie on the line."""
 
 _LIT_SHARE = 0.25
 """Share of the median of rows (of a lying bar: columns) from which on one belongs to the bar."""
 
-_LEAST_PHASE_SUM = 4.0
+_MIN_PHASE_SUM = 4.0
 """Length of the sum of the phases of rises in a chip, in roots of their number, from which on they come with
 the chips: random ones reach it once in 10 million cases."""
 
-_CELL_SHIFT, _CELL_EVENTS, _MOST_AREAS = 4, 8, 4
+_CELL_SHIFT, _CELL_EVENTS, _MAX_AREAS = 4, 8, 4
 """Cells of 16 px with so many events show where something moves; and how many such areas, those with the most
 events, are searched."""
 
-_MOST_PHASES = 4000
+_MAX_PHASES = 4000
 """Rises whose phases are summed at the most."""
 
 
@@ -87,11 +87,11 @@ def fit_sweep(
         least_px_us: Speed across the line, half of which it must have.
     """
     left, top, right, bottom = box
-    every = max(events.t_us.size // _MOST_EVENTS, 1)
+    every = max(events.t_us.size // _MAX_EVENTS, 1)
     t, x, y = (column[::every].astype(np.float64) for column in (events.t_us, events.x, events.y))
     inside = (x >= left) & (x < right) & (y >= top) & (y < bottom)
     t, x, y = t[inside] - middle_us, x[inside], y[inside]
-    if t.size < _LEAST_SAMPLES or t.size * every < _LEAST_EVENTS:
+    if t.size < _MIN_SAMPLES or t.size * every < _MIN_EVENTS:
         return None
     upright = float(y.std()) >= float(x.std())
     across, along = (x, y - along_px_us * t) if upright else (y, x - along_px_us * t)
@@ -106,7 +106,7 @@ def fit_sweep(
         residual = np.abs(across - plane @ terms)
         sigma = max(1.48 * float(np.median(residual)), 0.7)
         near = residual <= _OUTLIER * sigma
-    if sigma > _WIDEST_PX or near.mean() < _LEAST_SHARE:
+    if sigma > _WIDEST_PX or near.mean() < _MIN_SHARE:
         return None
     across_px_us = float(plane[1]) * 1e-3
     first, last = _find_ends(along[near])
@@ -133,11 +133,11 @@ def _find_ends(places: NDArray[np.float64]) -> tuple[float, float]:
 def has_chip_rhythm(events: Events, box: Box, chip_us: float) -> bool:
     """Whether the rises in a box come with the chips."""
     t_us = events.t_us[mask_inside(events, box) & (events.p > 0)]
-    t_us = t_us[:: max(t_us.size // _MOST_PHASES, 1)]
+    t_us = t_us[:: max(t_us.size // _MAX_PHASES, 1)]
     if not t_us.size:
         return False
     phases = np.exp(2j * math.pi / chip_us * (t_us - t_us[0])).sum()
-    return bool(abs(phases) > _LEAST_PHASE_SUM * math.sqrt(t_us.size))
+    return bool(abs(phases) > _MIN_PHASE_SUM * math.sqrt(t_us.size))
 
 
 def find_sweeps(
@@ -150,11 +150,11 @@ def find_sweeps(
 ) -> list[Sweep]:
     """Find bars that sweep over the image in a step, outside of known boxes; without `chip_us`, any lines."""
     columns, rows = ((n - 1 >> _CELL_SHIFT) + 1 for n in size_px)
-    every = max(events.t_us.size // _MOST_PHASES, 1)
+    every = max(events.t_us.size // _MAX_PHASES, 1)
     cells = (events.y[::every] >> _CELL_SHIFT).astype(np.int64) * columns + (events.x[::every] >> _CELL_SHIFT)
     counts = np.bincount(cells, minlength=rows * columns).reshape(rows, columns).astype(np.int16)
     counts[counts < _CELL_EVENTS] = 0
-    areas, _ = find_areas(counts, _MOST_AREAS, size_px, _CELL_SHIFT)
+    areas, _ = find_areas(counts, _MAX_AREAS, size_px, _CELL_SHIFT)
     sweeps = []
     for area in areas:
         box = grow_box(area, 1 << _CELL_SHIFT)

@@ -15,7 +15,7 @@ from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Trust
 
-_MOST_VERIFIED = 4096
+_MAX_VERIFIED = 4096
 """Transmitter ids whose last verified beacon is remembered: those received last."""
 
 _CLOCK_TOLERANCE_S = 300.0
@@ -114,7 +114,7 @@ class BeaconVerifier:
         if verdict.trust == "verified":
             self._verified[message.transmitter_id] = _Verified(message, beacon, grants)
             self._verified.move_to_end(message.transmitter_id)
-            while len(self._verified) > _MOST_VERIFIED:
+            while len(self._verified) > _MAX_VERIFIED:
                 self._verified.popitem(last=False)
         return verdict
 

@@ -41,7 +41,7 @@ _COMPARED_PIECES = 32
 _LARGEST_DRIFT_DEG_S = 5.0
 """Rate at rest above that of any gyroscope that is of use for a track."""
 
-_MOST_KNOTS = 4096
+_MAX_KNOTS = 4096
 """Lines of a log that one step of a track uses; of more, every second, third ... counts."""
 
 
@@ -284,7 +284,7 @@ class AttitudeLog:
         if self._has_gap(first - 1, int(np.searchsorted(self.t_us, end_us))):
             return None
         inner = self.t_us[first:last]
-        inner = inner[inner < end_us][:: 1 + len(inner) // _MOST_KNOTS]
+        inner = inner[inner < end_us][:: 1 + len(inner) // _MAX_KNOTS]
         t_us = np.concatenate([[start_us], inner, [end_us]])
         angle = np.interp(t_us, self.t_us, turn_rad)
         acceleration = self._acceleration_m_s2

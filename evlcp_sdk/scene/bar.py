@@ -17,13 +17,13 @@ from evlcp_sdk.files import read_table
 from evlcp_sdk.formatting import format_value, suggest
 from evlcp_sdk.specs import SpecError, build_spec
 
-_MOST_LEDS = 1 << 16
+_MAX_LEDS = 1 << 16
 
-_MOST_M = 100.0
+_MAX_M = 100.0
 """Largest distance of an LED from its transmitter's centre."""
 
 _SAME_M = 1e-9
-_MOST_GAP_LEDS = 3.0
+_MAX_GAP_LEDS = 3.0
 """Widest dark gap between clusters, in widths of an LED, that blur fills with their light."""
 
 Floats = NDArray[np.float64]
@@ -130,8 +130,8 @@ class LedRing:
         return np.round(place, 9), number // self.cluster_leds
 
 
-_Metres = Annotated[float, Field(ge=-_MOST_M, le=_MOST_M)]
-_Cluster = Annotated[int, Field(ge=0, lt=_MOST_LEDS)]
+_Metres = Annotated[float, Field(ge=-_MAX_M, le=_MAX_M)]
+_Cluster = Annotated[int, Field(ge=0, lt=_MAX_LEDS)]
 
 
 @dataclass(frozen=True)
@@ -305,7 +305,7 @@ class BarLayout:
         place, cluster_ids = self._leds
         centres = self.cluster_centres_m()
         size = np.array([np.ptp(place[cluster_ids == k, :2], axis=0) for k in range(self.clusters)])
-        most_m = (1 + _MOST_GAP_LEDS) * self.shape.led_m
+        most_m = (1 + _MAX_GAP_LEDS) * self.shape.led_m
         sides = np.zeros(self.clusters, np.int64)
         offset = centres[None] - centres[:, None]
         for axis, (before, after) in ((1, (1, 2)), (0, (4, 8))):
@@ -375,11 +375,11 @@ def read_leds(path: Path | str) -> list[list[float | int]]:
         InputError: The file cannot be read, or is not CSV.
         ConfigError: A column is missing, a value is out of range, or there are more than 65536 LEDs.
     """
-    limits = (-_MOST_M, _MOST_M)
-    needed = {"x_m": limits, "y_m": limits, "cluster": (0, _MOST_LEDS - 1)}
+    limits = (-_MAX_M, _MAX_M)
+    needed = {"x_m": limits, "y_m": limits, "cluster": (0, _MAX_LEDS - 1)}
     lines, table = read_table(path, needed, {"z_m": limits})
-    if len(lines) > _MOST_LEDS:
-        raise ConfigError(f"{path}: line {lines[_MOST_LEDS]}: expected at most {_MOST_LEDS} LEDs")
+    if len(lines) > _MAX_LEDS:
+        raise ConfigError(f"{path}: line {lines[_MAX_LEDS]}: expected at most {_MAX_LEDS} LEDs")
     for line, cluster in zip(lines, table["cluster"].tolist(), strict=True):
         if cluster != int(cluster):
             raise ConfigError(f"{path}: line {line}: cluster = {cluster:g}: expected a whole number")
@@ -389,9 +389,9 @@ def read_leds(path: Path | str) -> list[list[float | int]]:
 
 
 def _check_count(leds: int, problem: str) -> None:
-    if not 0 < leds <= _MOST_LEDS:
+    if not 0 < leds <= _MAX_LEDS:
         least = "" if leds else ", and one at least"
-        raise ConfigError(f"{problem}: expected at most {_MOST_LEDS} LEDs{least}")
+        raise ConfigError(f"{problem}: expected at most {_MAX_LEDS} LEDs{least}")
 
 
 def _check_divisor(name: str, block: int, of: str, n: int) -> None:

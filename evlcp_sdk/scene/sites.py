@@ -19,10 +19,10 @@ from evlcp_sdk.formatting import suggest, to_toml_value
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.specs import SpecError, build_spec, read_toml
 
-_LEAST_UPRIGHT = 0.1
+_MIN_UPRIGHT = 0.1
 """Sine of a bar axis' elevation below which the bar counts as lying, so that its LEDs face horizontally."""
 
-_LEAST_FACING = 0.01
+_MIN_FACING = 0.01
 """Sine of the angle between a bar's axis and its facing, below which the facing is undetermined."""
 
 
@@ -115,12 +115,12 @@ class BarSite:
             raise ConfigError(f"{name}: facing_deg: missing; expected where the LEDs shine to")
         up, facing = self.axis_enu(), math.radians(self.facing_deg)
         towards = np.array([math.sin(facing), math.cos(facing), 0.0])
-        if abs(up[2]) >= _LEAST_UPRIGHT:
+        if abs(up[2]) >= _MIN_UPRIGHT:
             # At a right angle to the axis, above or below the facing on the horizon.
             towards[2] = -(towards @ up) / up[2]
         else:
             towards -= (towards @ up) * up
-        if np.linalg.norm(towards) < _LEAST_FACING:
+        if np.linalg.norm(towards) < _MIN_FACING:
             raise ConfigError(f"{name}: facing_deg = {self.facing_deg:g}: its axis points there")
         towards /= np.linalg.norm(towards)
         x, y, z = bar.cluster_positions_m().T[:, :, None] * (self.length_m / bar.length_m)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedRing, LedTable
-from evlcp_sdk.sim.scene import MOST_SOURCES, BarSpec
+from evlcp_sdk.sim.scene import MAX_SOURCES, BarSpec
 
 _ALIGNED_M = 1e-6
 """LEDs aligned to a micrometre make one strip."""
@@ -86,9 +86,9 @@ def split_into_strips(bar: BarSpec, layout: BarLayout, seed: int = 0) -> list[Li
     unused = np.ones(len(place), np.bool_)
     found: list[LitStrip] = []
     while unused.any():
-        if len(found) == MOST_SOURCES:
+        if len(found) == MAX_SOURCES:
             raise ConfigError(
-                f"link: bar: its LEDs stand in more than {MOST_SOURCES} columns and rows, which none renders"
+                f"link: bar: its LEDs stand in more than {MAX_SOURCES} columns and rows, which none renders"
             )
         counts = [np.bincount(line[unused]) for line in lines]
         axis = int(counts[1].max() > counts[0].max())

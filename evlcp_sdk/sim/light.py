@@ -21,7 +21,7 @@ from evlcp_sdk.sim.leds import LitStrip, split_into_strips
 from evlcp_sdk.sim.motion import Strip
 from evlcp_sdk.sim.optics import led_light_w_m2
 from evlcp_sdk.sim.scene import (
-    MOST_SOURCES,
+    MAX_SOURCES,
     BackgroundSpec,
     BarSpec,
     LampSpec,
@@ -444,9 +444,9 @@ def sources_of(scene: Scene, registry: Registry | None = None) -> tuple[list[Bar
     ]
     lamps = [make_lamp_source(lamp) for lamp in (*scene.lamps, *_draw_lamps(scene))]
     columns = sum(len(bar.strips) + len(bar.images) for bar in bars)
-    if columns + len(lamps) > MOST_SOURCES:
+    if columns + len(lamps) > MAX_SOURCES:
         raise ConfigError(
             f"bars and lamps: {columns} columns and rows of LEDs and {len(lamps)} lamps, expected at most"
-            f" {MOST_SOURCES} together, reflections included"
+            f" {MAX_SOURCES} together, reflections included"
         )
     return bars, lamps

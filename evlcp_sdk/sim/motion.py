@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 _SINES = 128
 
-_MOST_VALUE = 1e6
+_MAX_VALUE = 1e6
 """Largest number of a path: beyond, its splines lose millimetres."""
 
 _SHORTEST_S = 1e-6
@@ -116,7 +116,7 @@ def pothole_angle_rad(motion: MotionSpec, t_us: ArrayLike) -> Floats:
 
 def _read_path(path: Path, duration_s: float) -> CubicSpline:
     names = ("t_s", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
-    _, columns = read_table(path, dict.fromkeys(names, (-_MOST_VALUE, _MOST_VALUE)), {}, rising="t_s")
+    _, columns = read_table(path, dict.fromkeys(names, (-_MAX_VALUE, _MAX_VALUE)), {}, rising="t_s")
     table = np.stack([columns[name] for name in names], 1)
     if len(table) < 2 or (np.diff(table[:, 0]) < _SHORTEST_S).any():
         raise ConfigError(f"{path}: expected two lines or more with rising t_s, {_SHORTEST_S:g} s apart")

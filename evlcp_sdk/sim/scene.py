@@ -26,10 +26,10 @@ from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.specs import SpecError, build_spec, parse_toml, parse_value, read_toml
 
-MOST_PIXELS = 4096
+MAX_PIXELS = 4096
 """Columns and rows of a sensor."""
 
-MOST_SOURCES = 64
+MAX_SOURCES = 64
 """Strips of light of one scene: lamps, and columns or rows of LEDs, again for every reflection."""
 
 LinkTable = Mapping[str, Any]
@@ -294,7 +294,7 @@ class BackgroundSpec:
         int,
         Field(
             ge=0,
-            le=MOST_PIXELS,
+            le=MAX_PIXELS,
             description="How far around bars and lamps its own events are simulated, too; 0: only on pixels"
             " that these light; the width of the image: everywhere.",
         ),
@@ -413,8 +413,8 @@ class Scene:
     drops: tuple[DropSpec, ...] = ()
 
     def __post_init__(self) -> None:
-        if len(self.bars) + len(self.lamps) + self.flicker_lamps > MOST_SOURCES:
-            raise ConfigError(f"bars and lamps: expected at most {MOST_SOURCES} together")
+        if len(self.bars) + len(self.lamps) + self.flicker_lamps > MAX_SOURCES:
+            raise ConfigError(f"bars and lamps: expected at most {MAX_SOURCES} together")
         for i, reflection in enumerate(self.reflections):
             if reflection.bar is not None and reflection.bar >= len(self.bars):
                 some = format_count(len(self.bars), "bar")
@@ -434,8 +434,8 @@ class Scene:
         times_s = [at_s for at_s, _ in self.background.change_s]
         if times_s and (times_s[0] < 0 or any(b <= a for a, b in pairwise(times_s))):
             raise ConfigError(f"background.change_s = {times_s}: expected times from 0 on that rise")
-        if max(self.camera.width, self.camera.height) > MOST_PIXELS:
-            raise ConfigError(f"camera: expected at most {MOST_PIXELS} columns and rows")
+        if max(self.camera.width, self.camera.height) > MAX_PIXELS:
+            raise ConfigError(f"camera: expected at most {MAX_PIXELS} columns and rows")
         if self.lens.focus_m * 1e3 <= self.camera.focal_mm:
             raise ConfigError(f"lens.focus_m = {self.lens.focus_m}: expected beyond the focal length")
         for i, bar in enumerate(self.bars):

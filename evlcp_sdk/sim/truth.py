@@ -22,10 +22,10 @@ Floats = NDArray[np.float64]
 _DARK_W_M2 = 1e-6
 """Most light of a dark bar."""
 
-_MOST_VALUE = 1e18
+_MAX_VALUE = 1e18
 """Largest number in a truth: microseconds since 1970 are 1e15."""
 
-_MOST_PPM = 1e5
+_MAX_PPM = 1e5
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +253,7 @@ def _to_bar_table(bar: SentBar) -> dict[str, Any]:
     }
 
 
-_Number = Annotated[float, Field(ge=-_MOST_VALUE, le=_MOST_VALUE)]
+_Number = Annotated[float, Field(ge=-_MAX_VALUE, le=_MAX_VALUE)]
 _Count = Annotated[int, Field(ge=1, le=2**32)]
 _Cluster = Annotated[int, Field(ge=0, le=2**32)]
 
@@ -264,15 +264,15 @@ class _Table(BaseModel):
 
 class _SceneTable(_Table):
     t0_us: _Number
-    duration_s: Annotated[float, Field(ge=0, le=_MOST_VALUE)]
+    duration_s: Annotated[float, Field(ge=0, le=_MAX_VALUE)]
 
 
 class _BarTable(_Table):
     """A bar with its link; or, in a file of another generator, with its profile, clusters and frames."""
 
     symbols: list[list[list[_Cluster]]]
-    start_chip: Annotated[float, Field(ge=0, le=_MOST_VALUE)]
-    ppm: Annotated[float, Field(ge=-_MOST_PPM, le=_MOST_PPM)]
+    start_chip: Annotated[float, Field(ge=0, le=_MAX_VALUE)]
+    ppm: Annotated[float, Field(ge=-_MAX_PPM, le=_MAX_PPM)]
     payload: Literal["symbols", "data", "messages"] | None = None
     led_w_m2: _Number | None = None
     chips_file: str | None = None

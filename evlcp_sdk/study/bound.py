@@ -23,13 +23,13 @@ from evlcp_sdk.values import NO_RANGE, FrameView, PresenceMap, Range
 
 Array = NDArray[np.float64]
 
-_LEAST_INFORMATION = 1e-9
+_MIN_INFORMATION = 1e-9
 """Share of a parameter's own information below which the other parameters leave none."""
 
-_LEAST_GAIN = 0.01
+_MIN_GAIN = 0.01
 """Gain below which a fit has found no light: one event in some thirty values."""
 
-_MOST_SCALE_ERROR = 0.2
+_MAX_SCALE_ERROR = 0.2
 """Share by which a fit's scale may differ from that of the clusters' middles; beyond, it is no fit."""
 
 _MOTION_SIGMA_PX = 3.0
@@ -45,10 +45,10 @@ pixels, they do not show it."""
 _PRIOR_NOISE = 0.1
 """Noise of a row's value, in full values, that priors are weighed against."""
 
-_LEAST_FREE_SHARE = 0.1
+_MIN_FREE_SHARE = 0.1
 """Least share of a row's residual: a row that decides a parameter by itself does not show the noise."""
 
-_LEAST_BOUNDARIES = 3
+_MIN_BOUNDARIES = 3
 """Boundaries without which spacing, position and drift cannot be separated."""
 
 
@@ -118,8 +118,8 @@ def _parameter_sigmas(information: Array) -> Array:
     for i, k in enumerate(np.flatnonzero(shown)):
         others = np.delete(np.arange(len(scaled)), i)
         row = scaled[i, others]
-        remaining = 1.0 - row @ np.linalg.pinv(scaled[np.ix_(others, others)], rcond=_LEAST_INFORMATION) @ row
-        if remaining > _LEAST_INFORMATION:
+        remaining = 1.0 - row @ np.linalg.pinv(scaled[np.ix_(others, others)], rcond=_MIN_INFORMATION) @ row
+        if remaining > _MIN_INFORMATION:
             sigmas[k] = 1 / (own[k] * math.sqrt(remaining))
     return sigmas
 
@@ -159,7 +159,7 @@ def frame_bound(link: Link, *, full_events: float = 3.0) -> Callable[[FrameView]
 
 def _compute_frame_bound(link: Link, full_events: float, view: FrameView) -> Range:
     seen, middles = _find_middles(view.presence)
-    if int((seen[1:] & seen[:-1]).sum()) < _LEAST_BOUNDARIES:
+    if int((seen[1:] & seen[:-1]).sum()) < _MIN_BOUNDARIES:
         return NO_RANGE
     width, height = np.ptp(middles[seen], axis=0)
     is_upright = bool(height >= width)
@@ -306,14 +306,14 @@ def _fit_frame(
     start_fit = np.concatenate([start, np.zeros(len(when))])
     solution = least_squares(residuals, start_fit, slopes, method="lm", x_scale=scale)
     spacing, blur = solution.x[0], np.exp(solution.x[4])
-    scales = abs(spacing / start[0] - 1) < _MOST_SCALE_ERROR
-    if not (solution.success and solution.x[3] > _LEAST_GAIN and blur < spacing and scales):
+    scales = abs(spacing / start[0] - 1) < _MAX_SCALE_ERROR
+    if not (solution.success and solution.x[3] > _MIN_GAIN and blur < spacing and scales):
         return None
     count = int(used.sum())
     jacobian = slopes(solution.x)
     # Residuals are smaller by the rows' leverage on the fit.
     leverage = (np.linalg.qr(jacobian)[0] ** 2).sum(1)[:count]
-    squares = solution.fun[:count] ** 2 / np.maximum(1 - leverage, _LEAST_FREE_SHARE)
+    squares = solution.fun[:count] ** 2 / np.maximum(1 - leverage, _MIN_FREE_SHARE)
     weight = jacobian[:count, 0] ** 2
     variance = float((weight * squares).sum() / max(float(weight.sum()), 1e-300))
     if not variance > 0:

@@ -24,7 +24,7 @@ INTERVALS = (
 )
 """Note on the intervals of `measure_figure`, for readers."""
 
-_MOST_TAILS = 2.0
+_MAX_TAILS = 2.0
 _RESAMPLES = 2000
 _SEED = 20_251_020
 
@@ -133,6 +133,6 @@ def ratio_interval(
     least = -float(special.stdtrit(n - 1, tail))
     quantiles = np.quantile(deviations, [1 - tail, tail]) if len(deviations) else (0.0, 0.0)
     down, up = (
-        min(max(end, least), _MOST_TAILS * least) for end in (float(quantiles[0]), -float(quantiles[1]))
+        min(max(end, least), _MAX_TAILS * least) for end in (float(quantiles[0]), -float(quantiles[1]))
     )
     return float(ratio[0] * math.exp(-down * error[0])), float(ratio[0] * math.exp(up * error[0]))

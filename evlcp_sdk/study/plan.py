@@ -204,8 +204,8 @@ class _File:
     link: _Grid = _Grid()
 
 
-_MOST_CASES = 10_000
-_MOST_TASKS = 1_000_000
+_MAX_CASES = 10_000
+_MAX_TASKS = 1_000_000
 """A task takes a second or more; a larger campaign would end in weeks."""
 
 MakeCase = Callable[[str | None, Sequence[str]], Case]
@@ -251,10 +251,10 @@ def load_plan(
         raise ConfigError("\n".join(dict.fromkeys(faults)))
     campaign = file.campaign
     tasks = len(scenes) * len(links) * campaign.seeds
-    if tasks > _MOST_TASKS:
+    if tasks > _MAX_TASKS:
         raise ConfigError(
             f"{path}: {len(scenes)} scenes x {len(links)} links x {campaign.seeds} seeds: {tasks} tasks,"
-            f" expected at most {_MOST_TASKS}"
+            f" expected at most {_MAX_TASKS}"
         )
     return Plan(
         campaign.name,
@@ -295,8 +295,8 @@ def _make_cases(
             faults.append(f"{path}: {kind}.grid.{key}: a value stands there twice")
     count = math.prod(len(values) for values in axes.values() if isinstance(values, list))
     count *= max(len(grid.variants), 1)
-    if count > _MOST_CASES:
-        faults.append(f"{path}: {kind}: {count} cases of grid and variants, expected at most {_MOST_CASES}")
+    if count > _MAX_CASES:
+        faults.append(f"{path}: {kind}: {count} cases of grid and variants, expected at most {_MAX_CASES}")
     if faults:
         return []
     base = grid.base

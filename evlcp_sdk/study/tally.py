@@ -35,7 +35,7 @@ Count = Annotated[int, Field(ge=0, lt=2**53)]
 Sum = Annotated[int, Field(ge=0, le=_MOST)]
 Histogram = dict[Annotated[int, Field(ge=-_FARTHEST_POSITION_BIN, le=_FARTHEST_POSITION_BIN)], Count]
 _LARGEST = ("worst_nm",)
-_MOST_SIGMAS = 1e6
+_MAX_SIGMAS = 1e6
 """Largest error that is counted, in sigmas; also for a sigma of 0."""
 
 
@@ -191,7 +191,7 @@ class Tally:
         {-3: 1}
         """
         error_nm = to_nm(error_m)
-        sigmas = min(abs(error_m / sigma_m), _MOST_SIGMAS) if sigma_m else _MOST_SIGMAS
+        sigmas = min(abs(error_m / sigma_m), _MAX_SIGMAS) if sigma_m else _MAX_SIGMAS
         bin = max(-_FARTHEST_BIN, min(_FARTHEST_BIN, error_nm // to_nm(BIN_M)))
         return cls(
             ranged=1,
@@ -344,7 +344,7 @@ class Tally:
 
 
 def _nees_micro(nees: float) -> int:
-    return round(min(nees, _MOST_SIGMAS**2) * 1e6)
+    return round(min(nees, _MAX_SIGMAS**2) * 1e6)
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from evlcp_sdk.testing.law import Subject, expect, law
 from evlcp_sdk.testing.views import ideal_frame, ideal_presence, ideal_sums
 
 _COUNTS = (2, 4, 8, 16, 24, 32)
-_MOST_ALIKE = 0.25
+_MAX_ALIKE = 0.25
 """Most normalised correlation of two pilots: 3 of 8 values differ, so that one error is corrected."""
-_MOST_SIDELOBE = 0.25
-_MOST_EDGES_ALIKE = 0.6
+_MAX_SIDELOBE = 0.25
+_MAX_EDGES_ALIKE = 0.6
 """The same for the edges of other than pair codes, and for sidelobes of their preamble: pulses of two codes
 coincide in half of the cases."""
 _NEAR_CHIPS = 3
@@ -60,7 +60,7 @@ def _check_pilot_correlation(subject: Subject) -> None:
         alike = edges @ edges.T / np.outer(many, many)
         np.fill_diagonal(alike, -1)
         i, j = np.unravel_index(alike.argmax(), alike.shape)
-        most = _MOST_ALIKE if is_pair_code(codes) else _MOST_EDGES_ALIKE
+        most = _MAX_ALIKE if is_pair_code(codes) else _MAX_EDGES_ALIKE
         expect(
             alike.max() <= most,
             f"two of {len(codes)} pilots to correlate by {most} at most,"
@@ -72,7 +72,7 @@ def _check_pilot_correlation(subject: Subject) -> None:
 def _check_preamble_sidelobes(subject: Subject) -> None:
     preamble = subject.algorithm.preamble()
     code = _select_edges(preamble)
-    most, near = (_MOST_SIDELOBE, 1) if is_pair_code(preamble) else (_MOST_EDGES_ALIKE, _NEAR_CHIPS)
+    most, near = (_MAX_SIDELOBE, 1) if is_pair_code(preamble) else (_MAX_EDGES_ALIKE, _NEAR_CHIPS)
     side = np.abs(np.correlate(code, code, "full")[len(code) - 1 + near :]).max(initial=0) / (code**2).sum()
     expect(side <= most, f"sidelobes of the preamble of {most} at most, got {side:.2f}")
 

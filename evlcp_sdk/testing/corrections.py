@@ -20,7 +20,7 @@ _LLR = np.float32(8.0)
 """LLR of a bit received well: wrong once in 3000."""
 
 _BLOCKS = 40
-_MOST_RATE = 0.9
+_MAX_RATE = 0.9
 """Message bits per coded bit above which a code can correct no more than a bit or two."""
 
 
@@ -138,7 +138,7 @@ def _check_error_detection(subject: Subject) -> None:
 @law("corrects", "one bit in 100 wrong, or one in 50 not received, is put right and counted")
 def _check_correction(subject: Subject) -> None:
     code = compile_subject(subject)
-    if code.message_bits > _MOST_RATE * code.coded_bits:
+    if code.message_bits > _MAX_RATE * code.coded_bits:
         raise InapplicableLawError(
             f"{code.message_bits} message bits of {code.coded_bits}: no room to correct anything"
         )

@@ -31,7 +31,7 @@ packet's 346 chips. With few pixels and short packets the scatter of events leav
 _SAME = 1e-9
 """Relative tolerance: 0.1 ns in the times of these recordings."""
 _TOLERANCE_CHIPS = 0.75
-_MOST_BYTES = 1 << 22
+_MAX_BYTES = 1 << 22
 """Most bytes of a pickled state, however long the stream is."""
 _RESULTS = {"framing": "frames", "synchronization": "locks", "detection": "regions"}
 """Names of the results of a role."""
@@ -141,8 +141,8 @@ def _check_bounded(subject: Subject) -> None:
         noise = Events.of(t_us, np.zeros(n), np.zeros(n), rng.integers(0, 2, n))
         state, _ = deframer.step(state, noise, now_us)
     size = len(pickle.dumps(state))
-    what = f"a state of at most {_MOST_BYTES} bytes after ten packets of noise, got {size}"
-    expect(size <= _MOST_BYTES, what)
+    what = f"a state of at most {_MAX_BYTES} bytes after ten packets of noise, got {size}"
+    expect(size <= _MAX_BYTES, what)
 
 
 FRAMING = (

@@ -18,14 +18,14 @@ from firmware_host.protocol.rows import BOARD_LEDS, pack_led_rows
 
 WORD_CHIPS = 16
 PREAMBLE_CHIPS = 32
-MOST_FRAMES = 65_535
+MAX_FRAMES = 65_535
 """Packets that a board can compose: chips of a pilot and of an info segment, most chips of a preamble, and
 most frames."""
 
-MOST_RANDOM_FRAMES = 100_000
+MAX_RANDOM_FRAMES = 100_000
 """Most random frames: minutes of light, far more than any bank holds, but within memory."""
 
-MOST_CHIPS_A_SECOND = 1_000_000
+MAX_CHIPS_A_SECOND = 1_000_000
 """Highest chip rate of any board; each reports its own limit, too."""
 
 Symbols = NDArray[np.int64]
@@ -204,17 +204,17 @@ def is_composed(packet: PacketFormat, led_clusters: NDArray[np.int64]) -> bool:
         np.array_equal(led_clusters, BOARD_LEDS)
         and packet.pilot_chips == packet.info_chips == WORD_CHIPS
         and packet.preamble_chips <= PREAMBLE_CHIPS
-        and packet.frames <= MOST_FRAMES
+        and packet.frames <= MAX_FRAMES
     )
 
 
 def check_rate(packet: PacketFormat) -> None:
     """Raise ConfigError if no driver board can play the chip rate."""
     rate = packet.chip_rate_hz
-    if rate != round(rate) or rate > MOST_CHIPS_A_SECOND:
+    if rate != round(rate) or rate > MAX_CHIPS_A_SECOND:
         raise ConfigError(
             f"the driver board cannot play this link: air.chip_rate_hz = {rate},"
-            f" expected whole chips per second, at most {MOST_CHIPS_A_SECOND}"
+            f" expected whole chips per second, at most {MAX_CHIPS_A_SECOND}"
         )
 
 
@@ -255,10 +255,10 @@ def random_packets(packets: int, link: Link, seed: int) -> Symbols:
         ConfigError: There are none, or too many.
     """
     frames = link.packet.frames
-    if not 0 < packets * frames <= MOST_RANDOM_FRAMES:
+    if not 0 < packets * frames <= MAX_RANDOM_FRAMES:
         raise ConfigError(
             f"random = {packets}, air.frames_per_packet = {frames}: expected at least 1 packet,"
-            f" at most {MOST_RANDOM_FRAMES} frames in all"
+            f" at most {MAX_RANDOM_FRAMES} frames in all"
         )
     return random_symbols(packets, frames, link.codebook, np.random.default_rng(seed))
 

@@ -31,7 +31,7 @@ from firmware_host.protocol.generated.requests import (
 _BLOCK_BYTES = 2048
 """Bytes of a bank that are compared by one CRC."""
 
-_MOST_HOLD = 255
+_MAX_HOLD = 255
 """Most times that a board repeats a chip."""
 
 _SMALLEST_PIECE_BYTES = 32
@@ -237,7 +237,7 @@ class Board:
         """Times that the board repeats a chip of the bank; above 1 if these are longer than its longest."""
         info, rate = self.info, bank.chip_rate_hz
         if not bank.composed:
-            for hold in range(1, min(_MOST_HOLD, info.chip_rate_max_hz // rate) + 1):
+            for hold in range(1, min(_MAX_HOLD, info.chip_rate_max_hz // rate) + 1):
                 if rate * hold >= info.chip_rate_min_hz and info.tick_hz % (rate * hold) == 0:
                     return hold
         return 1

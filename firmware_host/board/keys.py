@@ -8,7 +8,7 @@ from evlcp_sdk.files import read_secret, write_secret
 from firmware_host.protocol.generated.requests import KEY_BYTES
 from firmware_host.protocol.seal import key_name
 
-_MOST_BYTES = 1024
+_MAX_BYTES = 1024
 
 
 def make_board_key(path: Path) -> str:
@@ -28,7 +28,7 @@ def read_board_key(path: Path) -> bytes:
     Raises:
         InputError: The file cannot be read, is accessible to others than its owner, or holds no key.
     """
-    text = read_secret(path, _MOST_BYTES)
+    text = read_secret(path, _MAX_BYTES)
     try:
         key = bytes.fromhex(text.decode("ascii").strip())
     except ValueError:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from firmware_host.board.messages import Content
 
-_MOST_NUMBER = 2**32 - 1
+_MAX_NUMBER = 2**32 - 1
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class ContentOptions:
         Path | None, typer.Option(metavar="private.pem", help="Sign the beacon; needs the extra sign.")
     ] = None
     transmitter_id: Annotated[
-        int | None, typer.Option("--id", metavar="ID", min=0, max=_MOST_NUMBER, help="Transmitter id.")
+        int | None, typer.Option("--id", metavar="ID", min=0, max=_MAX_NUMBER, help="Transmitter id.")
     ] = None
     sequence: Annotated[
         int | None,
         typer.Option(
             hidden=True,
             min=0,
-            max=_MOST_NUMBER,
+            max=_MAX_NUMBER,
             help="Sequence number; seconds since 1970 without it, so that it rises.",
         ),
     ] = None

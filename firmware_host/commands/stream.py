@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from firmware_host.board.stream import Stream
 
 _POLL_S = 0.005
-_MOST_LINES = 64
+_MAX_LINES = 64
 
 Ahead = Annotated[int, typer.Option(metavar="N", min=2, help="Packets on the board: few for a short delay.")]
 
@@ -145,7 +145,7 @@ def _read_lines(file: Path) -> Iterator[str | None]:
 
     from evlcp_sdk.errors import InputError
 
-    received: queue.Queue[str | Exception | None] = queue.Queue(_MOST_LINES)
+    received: queue.Queue[str | Exception | None] = queue.Queue(_MAX_LINES)
 
     def read() -> None:
         try:

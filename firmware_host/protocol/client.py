@@ -22,13 +22,13 @@ TRIES = 5
 BACKOFF = 2.0
 """Factor by which each further try waits longer for its answer."""
 
-MOST_LATENCY_S = 10.0
+MAX_LATENCY_S = 10.0
 """Largest latency that counts, if the measured one is larger, s."""
 
 SLOW_S = 0.1
 """Latency above which a board gets requests one at a time, s; a USB bridge's is 16 ms."""
 
-MOST_PATIENCE = 32.0
+MAX_PATIENCE = 32.0
 """Largest factor by which repeated requests lengthen the wait of the next ones."""
 
 
@@ -130,7 +130,7 @@ class Client:
     @property
     def latency_s(self) -> float:
         """Time that an answer may take beyond its time on the line, at least that of `timing`, s."""
-        measured = min((self._mean_s or 0.0) + 4 * self._spread_s, MOST_LATENCY_S)
+        measured = min((self._mean_s or 0.0) + 4 * self._spread_s, MAX_LATENCY_S)
         return max(self.timing.latency_s, measured) * self._patience
 
     def _can_send(self, pending: _PendingRequest) -> bool:
@@ -149,7 +149,7 @@ class Client:
         """Update the latency; after several tries it is unknown to which the answer belongs."""
         if pending.tries > 1:
             # kept until a request is answered at its first try
-            self._patience = min(self._patience * BACKOFF ** (pending.tries - 1), MOST_PATIENCE)
+            self._patience = min(self._patience * BACKOFF ** (pending.tries - 1), MAX_PATIENCE)
             return
         self._patience = 1.0
         self._largest = max(self._largest, len(pending.wire))

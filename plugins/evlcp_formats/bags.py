@@ -21,7 +21,7 @@ from evlcp_sdk.plugin.source import Loss
 
 TYPES: Final = ("event_camera_msgs/msg/EventPacket", "event_camera_msgs/EventPacket")
 
-_MOST_WAITING: Final = 256
+_MAX_WAITING: Final = 256
 """Packets that may wait for earlier ones: some seconds of a camera, 30 MB."""
 
 _STEPS: Final = 1_000_000
@@ -130,9 +130,9 @@ class _PacketOrder:
             if self._past.get(packet.seq) == digest or (same is not None and same.data == packet.data):
                 self.twice += 1
                 continue
-            self.out_of_order += packet.seq < latest <= packet.seq + _MOST_WAITING
+            self.out_of_order += packet.seq < latest <= packet.seq + _MAX_WAITING
             latest = packet.seq
-            while packet.seq in self._waiting or len(self._waiting) >= _MOST_WAITING:
+            while packet.seq in self._waiting or len(self._waiting) >= _MAX_WAITING:
                 yield self._pop()
             self._waiting[packet.seq] = packet
         while self._waiting:
@@ -142,14 +142,12 @@ class _PacketOrder:
         """Take out the packet that follows the last one, or else the first."""
         expected = next(reversed(self._past), -1) + 1
         near = (
-            [seq for seq in self._waiting if expected <= seq <= expected + _MOST_WAITING]
-            if self._past
-            else []
+            [seq for seq in self._waiting if expected <= seq <= expected + _MAX_WAITING] if self._past else []
         )
         packet = self._waiting.pop(min(near or self._waiting))
         self._past[packet.seq] = zlib.crc32(packet.data)
         self._past.move_to_end(packet.seq)
-        if len(self._past) > _MOST_WAITING:
+        if len(self._past) > _MAX_WAITING:
             self._past.popitem(last=False)
         return packet
 

@@ -21,10 +21,10 @@ _PLACES: Final = ("events", "raw_events", "CD/events")
 _ECF: Final = 36559
 """Number of the filter of Prophesee's codec, which no package with a permissive licence reads."""
 
-_MOST_CHUNK_BYTES: Final = 1 << 26
+_MAX_CHUNK_BYTES: Final = 1 << 26
 """Most bytes of a chunk, which is unpacked at once; libraries choose a thousandth of it."""
 
-_MOST_RATIO: Final = 1100
+_MAX_RATIO: Final = 1100
 """Most unpacked bytes per byte of a file: the limit of deflate is 1032."""
 
 
@@ -168,13 +168,13 @@ def _check_dataset(path: Path, dataset: Any) -> None:
             " convert it to RAW by metavision_file_to_raw, or write it without compression"
         )
     chunk_bytes = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
-    if chunk_bytes > _MOST_CHUNK_BYTES:
+    if chunk_bytes > _MAX_CHUNK_BYTES:
         raise InputError(
             f"{path}: {dataset.name} has chunks of {chunk_bytes / 1e6:.0f} MB,"
-            f" expected at most {_MOST_CHUNK_BYTES / 1e6:.0f}: h5repack makes them smaller"
+            f" expected at most {_MAX_CHUNK_BYTES / 1e6:.0f}: h5repack makes them smaller"
         )
     size_bytes = path.stat().st_size
-    if dataset.size * dataset.dtype.itemsize > _MOST_RATIO * size_bytes:
+    if dataset.size * dataset.dtype.itemsize > _MAX_RATIO * size_bytes:
         raise InputError(
             f"{path}: {dataset.name} is declared to have {dataset.size} values, more than"
             f" {size_bytes} bytes can hold"

@@ -16,7 +16,7 @@ from evlcp_sdk.io.fields import Fields
 from evlcp_sdk.io.lists import open_list
 
 _VALUE_BYTES: Final = 8
-_MOST_BYTES: Final = 300_000_000
+_MAX_BYTES: Final = 300_000_000
 
 
 def open_mat(url: str) -> ColumnSource:
@@ -35,9 +35,9 @@ def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
     try:
         declared = sum(math.prod(map(int, shape)) for _, shape, _ in whosmat(path)) * _VALUE_BYTES
-        if declared > _MOST_BYTES:
+        if declared > _MAX_BYTES:
             raise InputError(
-                f"{path}: holds {declared / 1e6:.0f} MB, expected at most {_MOST_BYTES / 1e6:.0f},"
+                f"{path}: holds {declared / 1e6:.0f} MB, expected at most {_MAX_BYTES / 1e6:.0f},"
                 " as they are read at once: save them as HDF5 (-v7.3)"
             )
         found = loadmat(path, simplify_cells=True)

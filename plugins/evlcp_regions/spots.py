@@ -21,10 +21,10 @@ _CELL_PX, _FINE_PX = 32, 8
 _SLOTS_PER_BIT, _LONGEST_SLOT_US = 2, 500
 """An edge wakes its burst within a slot: half a bit, or what a burst takes at the most."""
 
-_LEAST_EVENTS, _LEAST_PURITY = 6, 0.7
+_MIN_EVENTS, _MIN_PURITY = 6, 0.7
 """Events of a burst, and the share by which one polarity prevails among them."""
 
-_LEAST_TURNS = 6
+_MIN_TURNS = 6
 """Bursts of the other polarity than the one before, with no long time between, that show a spot."""
 
 _BURST_SHARE = 0.35
@@ -49,7 +49,7 @@ edges to compare: a bright LED at 30 m woke bursts of a ninth of its own."""
 _LAG_US = 1000.0
 """How much later dim pixels see an edge than bright ones, at the most."""
 
-_MOST_VEILED = 4
+_MAX_VEILED = 4
 """Lights in another's veil, the brightest, that are followed to see whether they have edges of their own:
 there may be many."""
 
@@ -71,7 +71,7 @@ places of a large light are about as bright as one another, and seen at about on
 _YOUNG_US = 6000.0
 """Age from which on a light is reported: until then others may show that it is a place of a larger one."""
 
-_MOST_GATE_PX = 64.0
+_MAX_GATE_PX = 64.0
 """How far from its predicted place a spot is sought at the most."""
 
 _SIZE_PX = 2.0
@@ -224,7 +224,7 @@ class _SpotDetector:
             return None
         displaced = near
         if is_veiled:
-            displaced = _find_excess([other for other in spots if not other.is_source], spot, _MOST_VEILED)
+            displaced = _find_excess([other for other in spots if not other.is_source], spot, _MAX_VEILED)
         if len(spots) - len(displaced) >= self.spec.most:
             displaced += _find_excess(spots, spot, self.spec.most)
         return None if any(other is spot for other in displaced) else displaced
@@ -319,16 +319,16 @@ class _SpotDetector:
         unseen_us = max(now_us - spot.t_us, 0.0)
         straight_us = _AGILITY_US * (1 - math.exp(-unseen_us / _AGILITY_US))
         x_px, y_px = spot.x_px + spot.right_px_us * straight_us, spot.y_px + spot.down_px_us * straight_us
-        gate_px = min(self.spec.reach_px + self.spec.speed_px_ms * unseen_us * 1e-3, _MOST_GATE_PX)
+        gate_px = min(self.spec.reach_px + self.spec.speed_px_ms * unseen_us * 1e-3, _MAX_GATE_PX)
         x, y = places
         mine = (np.abs(x - x_px) <= gate_px) & (np.abs(y - y_px) <= gate_px)
         for u_px, v_px in others:
             mine &= (np.abs(x - u_px) > self.spec.reach_px) | (np.abs(y - v_px) > self.spec.reach_px)
         near = np.flatnonzero(mine)
-        if len(near) < _LEAST_EVENTS:
+        if len(near) < _MIN_EVENTS:
             return spot, x_px, y_px
         x, y, t, on = x[near], y[near], events.t_us[near], events.p[near] > 0
-        least = max(_LEAST_EVENTS, _BURST_SHARE * spot.burst)
+        least = max(_MIN_EVENTS, _BURST_SHARE * spot.burst)
         slot = self._slot_numbers(t, start_us)
         burst = self._find_burst(x, y, slot, on, least, (x_px, y_px, gate_px))
         if burst is not None:
@@ -342,7 +342,7 @@ class _SpotDetector:
             return spot, x_px, y_px
         for _ in range(2):
             inside = (np.abs(x - u_px) <= self.spec.reach_px) & (np.abs(y - v_px) <= self.spec.reach_px)
-            if inside.sum() < _LEAST_EVENTS:
+            if inside.sum() < _MIN_EVENTS:
                 return spot, x_px, y_px
             u_px, v_px = float(x[inside].mean()), float(y[inside].mean())
         t_us = float(t[inside].mean())
@@ -379,7 +379,7 @@ class _SpotDetector:
         every, ones = (counts[:, :-1] + counts[:, 1:] for counts in (every, ones))
         every, ones = (counts[..., :-1] + counts[..., 1:] for counts in (every, ones))
         excess = np.abs(2 * ones - every)
-        excess[excess < _LEAST_PURITY * every] = 0
+        excess[excess < _MIN_PURITY * every] = 0
         best = int(excess.argmax())
         if excess.flat[best] < least:
             return None
@@ -399,7 +399,7 @@ class _SpotDetector:
     ) -> tuple[dict[int, _CellTurns], list[_Spot]]:
         """Update the turns of cells by the bursts of a step; return them and the lights that they show."""
         known = {cell: turns for cell, turns in cells.items() if start_us - turns.t_us <= self.gap_us}
-        if len(events) < _LEAST_EVENTS:
+        if len(events) < _MIN_EVENTS:
             return known, []
         columns = -(-self.width // _CELL_PX)
         cell_count = columns * -(-self.height // _CELL_PX)
@@ -408,7 +408,7 @@ class _SpotDetector:
         index = slot * cell_count + cell
         every = np.bincount(index)
         signed = np.bincount(index, 2.0 * events.p.astype(np.float64) - 1.0)
-        bursts = np.flatnonzero((every >= _LEAST_EVENTS) & (np.abs(signed) >= _LEAST_PURITY * every))
+        bursts = np.flatnonzero((every >= _MIN_EVENTS) & (np.abs(signed) >= _MIN_PURITY * every))
         new = []
         for at in bursts.tolist():
             number, t_us = at % cell_count, start_us + (at // cell_count + 0.5) * self.slot_us
@@ -418,7 +418,7 @@ class _SpotDetector:
                 known[number] = _CellTurns(lit, 0, t_us)
             elif before.lit != lit:
                 known[number] = _CellTurns(lit, before.turns + 1, t_us)
-                if before.turns + 1 >= _LEAST_TURNS:
+                if before.turns + 1 >= _MIN_TURNS:
                     inside = index == at
                     place = _median(events.x[inside]), _median(events.y[inside])
                     burst = float(every[at])

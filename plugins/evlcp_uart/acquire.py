@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_uart.light import CONTEXTS, OUTLIER, TICKS, Floats, Light, Ticks, guess_lights, log_sum_exp
-from evlcp_uart.reader import CLOCK_SHARE, LEAST_CHARACTERS, TAIL, CharacterReader, Stretch
+from evlcp_uart.reader import CLOCK_SHARE, MIN_CHARACTERS, TAIL, CharacterReader, Stretch
 
-_LEAST_WORTH = 0.5
+_MIN_WORTH = 0.5
 """Least mean log-likelihood ratio of a character by the light learned from the other half of a stretch."""
 
 _INVERTED_BITS = 10.0
@@ -40,7 +40,7 @@ _UNFRAMED_BITS = 10.0
 
 _LEARN_EVENTS, _LEARN_CHARACTERS = 2400, 16
 """Events and characters to learn a light from; more of a bright one take longer and add nothing. The events
-are 30 an edge, `_MOST_EVENTS` of a window, with five edges a character."""
+are 30 an edge, `_MAX_EVENTS` of a window, with five edges a character."""
 
 _TRIED, _ROUNDS = 4, 5
 """Guesses of the light to refine, and how often each is learned again."""
@@ -80,7 +80,7 @@ def acquire_light(reader: CharacterReader, mark_on: bool, stretch: Stretch) -> t
     # Read alone, they might start at another bit.
     starts = reader.find_path(stretch, light, False)[0]
     starts = starts[starts >= part.end]
-    if len(starts) >= LEAST_CHARACTERS:
+    if len(starts) >= MIN_CHARACTERS:
         found, other = _choose_light(reader, rest, [(light, starts)], _REST_FRAMED)
         if found is None:
             return None, other
@@ -199,7 +199,7 @@ def _align_bursts(
     reader: CharacterReader, stretch: Stretch, light: Light, starts: Ticks, evidence: Floats
 ) -> Light:
     """Shift the start of bits so that events tell most of them, with each burst in the window of its bit."""
-    if len(starts) < LEAST_CHARACTERS:
+    if len(starts) < MIN_CHARACTERS:
         return light
     found = []
     known = reader.estimate_contexts(light, starts, evidence)
@@ -216,10 +216,10 @@ def _cross_validate(reader: CharacterReader, stretch: Stretch, light: Light) -> 
     """Return the score of each half of a stretch by the light learned from the other, summed."""
     starts, evidence, _ = reader.find_path(stretch, light, False)
     half = len(starts) // 2
-    if half < LEAST_CHARACTERS:
+    if half < MIN_CHARACTERS:
         return -np.inf
     middle = int(starts[half])
-    total = -_LEAST_WORTH * len(starts)
+    total = -_MIN_WORTH * len(starts)
     parts = (starts[:half], middle, stretch.end), (starts[half:], stretch.start, middle)
     for known, begin, end in parts:
         learned = reader.learn_light(stretch, light, known, evidence, 0.0)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.clock import TimeGrain
 from evlcp_uart.acquire import acquire_light
 from evlcp_uart.light import EARLY, TICKS, Floats, Light, Ticks
-from evlcp_uart.reader import LEAST_CHARACTERS, NEAR, TAIL, CharacterReader, Stretch
+from evlcp_uart.reader import MIN_CHARACTERS, NEAR, TAIL, CharacterReader, Stretch
 
 _BLOCK = 32
 """Characters of a block without pauses; a stretch of blocks is decoded at once."""
@@ -28,16 +28,16 @@ _DIM_BLOCKS, _CLEAR_QUALITY = 4, 0.95
 _BEFORE_FIRST = TICKS
 """Ticks before a stream's first event that are known by it, as it may be of an edge."""
 
-_LEAST_LAST_QUALITY = 0.95
+_MIN_LAST_QUALITY = 0.95
 """Least quality of a last character that extends beyond the last event."""
 
 _LOOKAHEAD = 4
 """Characters of lookahead: only those after it tell where one starts."""
 
-_LEAST_EVENTS = 24
+_MIN_EVENTS = 24
 """Least events of a stretch for a search for light."""
 
-_LEAST_FIRST_QUALITY = 0.85
+_MIN_FIRST_QUALITY = 0.85
 """Least mean quality of the first characters if they are few before a pause."""
 
 _MEMORY = 0.97
@@ -49,7 +49,7 @@ _SEARCH_PERIOD = 8
 _BUNCH_EVENTS, _BUNCH_TICKS = 6.0, TICKS // 2
 """Least weighted events per tick of bunches of a readout, and their largest spacing, less than of edges."""
 
-_MOST_EMPTY = 8
+_MAX_EMPTY = 8
 """Stretches with events and without a character after which the light is learned again."""
 
 
@@ -189,7 +189,7 @@ class CharacterDecoder:
         """Decode the first `due` ticks, with lookahead unless they are the last ones."""
         assert state.first is not None
         stretch, spread = self._prepare_stretch(state, due, last)
-        enough = int(stretch.counts[:, :due].sum()) >= _LEAST_EVENTS
+        enough = int(stretch.counts[:, :due].sum()) >= _MIN_EVENTS
         after = replace(
             state,
             first=state.first + due,
@@ -214,7 +214,7 @@ class CharacterDecoder:
             return replace(state, blocks=_DIM_BLOCKS), []
         if after.start == state.first + stretch.start and enough:
             # No character started.
-            lost = state.empty_stretches + 1 >= _MOST_EMPTY
+            lost = state.empty_stretches + 1 >= _MAX_EMPTY
             light, empty_stretches = (None, 0) if lost else (after.light, state.empty_stretches + 1)
             after = replace(after, light=light, empty_stretches=empty_stretches)
         return replace(after, blocks=1 if sure >= _CLEAR_QUALITY else _DIM_BLOCKS), found
@@ -259,7 +259,7 @@ class CharacterDecoder:
         if last and found:
             # The last edge of a character may be that before its first stop bit.
             needs = int(kept[-1]) + (self.reader.characters.bits - self.reader.characters.stop_bits) * TICKS
-            if needs >= stretch.end and (found[-1].quality < _LEAST_LAST_QUALITY or found[-1].wrong_parity):
+            if needs >= stretch.end and (found[-1].quality < _MIN_LAST_QUALITY or found[-1].wrong_parity):
                 found.pop()
         by_chance, ambiguous = 0, 0
         if is_new:
@@ -330,7 +330,7 @@ def _drop_chance_characters(found: list[Character]) -> list[Character]:
     gaps = np.diff([one.t_us for one in found])
     length = float(np.median(gaps)) if len(gaps) else np.inf
     paused = np.flatnonzero(gaps > 1.5 * length) + 1
-    if len(paused) and (few := int(paused[0])) < LEAST_CHARACTERS:
+    if len(paused) and (few := int(paused[0])) < MIN_CHARACTERS:
         sure = float(np.mean([one.quality for one in found[:few]]))
-        return found[few:] if sure < _LEAST_FIRST_QUALITY else found
+        return found[few:] if sure < _MIN_FIRST_QUALITY else found
     return found

@@ -21,17 +21,17 @@ from evlcp_uart.light import CONTEXTS, OUTLIER, TICKS, Floats, Light, Ticks, gue
 _BAND_HZ = 250.0, 30_000.0
 """Range of rates."""
 
-_BIN_US, _MOST_BINS = 16, 1 << 18
+_BIN_US, _MAX_BINS = 16, 1 << 18
 """Width of a bin for the spectrum, and most bins, 4 s."""
 
-_LINES, _LEAST_LINE_SHARE = 4, 0.5
+_LINES, _MIN_LINE_SHARE = 4, 0.5
 """Lines to try, and their least height as a share of the highest: if bursts are as wide as a bit, the lines
 of start and stop bits may be higher than that of all bits."""
 
-_LEAST_FUNDAMENTAL = 0.75
+_MIN_FUNDAMENTAL = 0.75
 """Least height of a fundamental line relative to its multiple; a line between bins is lower."""
 
-_LEARN_BITS, _MOST_BITS, _LEAST_BITS = 256, 2048, 64
+_LEARN_BITS, _MAX_BITS, _MIN_BITS = 256, 2048, 64
 """Bits to learn the light from, most bits to decode, and least bits for a result."""
 
 _TRIED, _ROUNDS = 4, 5
@@ -43,13 +43,13 @@ _EDGES = np.arange(CONTEXTS) % 4 % 3 > 0
 _PAUSE_BITS = 16
 """Bits next to an edge that are known by it; one of some hundred edges is missed."""
 
-_LEAST_PROBABILITY = 1e-3
+_MIN_PROBABILITY = 1e-3
 """Least probability of a bit: even a clear one may be of a damaged character."""
 
 _SUCCESSIVE_SHARE = 0.9
 """Expected share of characters that follow another without a pause."""
 
-_LEAST_EVIDENCE_BITS = 23.0
+_MIN_EVIDENCE_BITS = 23.0
 """Least evidence for a format, bits. With random bits a likelihood ratio is above 2^n less often than 2^-n:
 with 240 formats for each of three rates, in one of ten thousand recordings."""
 
@@ -97,8 +97,8 @@ def infer_format(t_us: Ticks, p: NDArray[np.uint8]) -> tuple[dict[str, Any], str
     ranked = max(_rank_formats(t_us, p), key=lambda formats: formats[0].bits, default=[])
     if not ranked:
         return {}, f"{none}{len(t_us)} events are too few"
-    if ranked[0].bits < _LEAST_EVIDENCE_BITS:
-        return {}, f"{none}at best {ranked[0].rate_hz:g} baud, {ranked[0]}, {_LEAST_EVIDENCE_BITS:g} needed"
+    if ranked[0].bits < _MIN_EVIDENCE_BITS:
+        return {}, f"{none}at best {ranked[0].rate_hz:g} baud, {ranked[0]}, {_MIN_EVIDENCE_BITS:g} needed"
     # Text of eight bits fits in either order of bits, but reads as text in one.
     near = [one for one in ranked if one.score >= _ALTERNATIVE_SHARE * ranked[0].score]
     best = max(near, key=lambda one: one.common)
@@ -120,12 +120,10 @@ def _rank_formats(t_us: Ticks, p: NDArray[np.uint8]) -> Iterator[list[_RatedForm
     for rate_hz in _find_rates(t_us, p):
         counts = _count_events((t_us - t_us[0]) * (1e-6 * TICKS * rate_hz), p, _LEARN_BITS * TICKS)
         blocks = counts.reshape(2, -1, _LEARN_BITS * TICKS).swapaxes(0, 1)
-        many = _MOST_BITS // _LEARN_BITS
+        many = _MAX_BITS // _LEARN_BITS
         first = int(np.convolve(blocks.sum((1, 2)), np.ones(many))[many - 1 :].argmax())
-        ones = np.clip(
-            _estimate_marks(blocks[first : first + many]), _LEAST_PROBABILITY, 1 - _LEAST_PROBABILITY
-        )
-        if len(ones) >= _LEAST_BITS:
+        ones = np.clip(_estimate_marks(blocks[first : first + many]), _MIN_PROBABILITY, 1 - _MIN_PROBABILITY)
+        if len(ones) >= _MIN_BITS:
             formats = [
                 _assess_format(Characters(*form), float(f"{rate_hz:.4g}"), idle, marks)
                 for idle, marks in (("on", ones), ("off", 1 - ones))
@@ -146,12 +144,12 @@ def _find_rates(t_us: Ticks, p: NDArray[np.uint8]) -> Iterator[float]:
     step_us = max(TimeGrain().update(t_us).step_us, 1)
     # Bins of whole steps do not beat with them.
     bin_us = step_us * max(_BIN_US // step_us, 1)
-    counts = _count_events((t_us - t_us[0]) / bin_us, p, 2)[:, :_MOST_BINS]
+    counts = _count_events((t_us - t_us[0]) / bin_us, p, 2)[:, :_MAX_BINS]
     power = (np.abs(np.fft.rfft(counts - counts.mean(1, keepdims=True), 2 * counts.shape[1])) ** 2).sum(0)
     step_hz = 1e6 / (2 * counts.shape[1] * bin_us)
     hz = np.arange(len(power)) * step_hz
     remaining = np.where((hz > _BAND_HZ[0]) & (hz < min(_BAND_HZ[1], 0.4e6 / bin_us)), power, 0.0)
-    least = _LEAST_LINE_SHARE * remaining.max()
+    least = _MIN_LINE_SHARE * remaining.max()
     for _ in range(_LINES):
         top = int(remaining.argmax())
         if remaining[top] <= 0 or remaining[top] < least:
@@ -159,7 +157,7 @@ def _find_rates(t_us: Ticks, p: NDArray[np.uint8]) -> Iterator[float]:
         for part in range(int(hz[top] / _BAND_HZ[0]), 0, -1):
             near = round(top / part) + np.arange(-2, 3)
             line = int(near[remaining[near].argmax()])
-            if remaining[line] >= _LEAST_FUNDAMENTAL * remaining[top]:
+            if remaining[line] >= _MIN_FUNDAMENTAL * remaining[top]:
                 break
         before, here, after = power[line - 1 : line + 2]
         curvature = before - 2 * here + after
@@ -241,7 +239,7 @@ def _assess_format(form: Characters, rate_hz: float, idle: str, marks: Floats) -
     fixed = np.log(2 * words[:, bits - form.stop_bits :]).sum(1)
     if form.parity != "none":
         balance = (1 - 2 * words[:, 1 : 2 + form.data_bits]).prod(1)
-        fixed += np.log(np.maximum(1 + balance * (1 if form.parity == "even" else -1), _LEAST_PROBABILITY))
+        fixed += np.log(np.maximum(1 + balance * (1 if form.parity == "even" else -1), _MIN_PROBABILITY))
     # In pauses each bit may be a start bit. Characters at both ends are cut.
     pause = np.log(marks)
     pause[:bits] = pause[-bits:] = 0

@@ -33,10 +33,10 @@ OUTLIER = 2e-3
 _PRIOR_WINDOWS, _PRIOR_GAINS = 3.0, 12.0
 """Weights, in windows of a context, of those with the same last bits, and of the prior shares."""
 
-_MOST_EVENTS = 30.0
+_MAX_EVENTS = 30.0
 """Events of a window that tell all; of more, each has less weight, as pixels share the light."""
 
-_MOST_WEIGHT = 0.85
+_MAX_WEIGHT = 0.85
 """Most weight of an event: light is learned from the bits that are read with it, and the events of a pixel
 are correlated."""
 
@@ -73,7 +73,7 @@ class Light:
     gains: Floats
     rate: float = 1.0
     paused: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    most: float = _MOST_WEIGHT
+    most: float = _MAX_WEIGHT
     inverted: bool = False
 
     @property
@@ -105,7 +105,7 @@ class Light:
         """Weight of an event."""
         # Events of all contexts have other causes than the light.
         informative = self.rates - self.rates.min(0)
-        return min(self.most, _MOST_EVENTS / max(float(informative.sum((1, 2)).max()), 1e-9))
+        return min(self.most, _MAX_EVENTS / max(float(informative.sum((1, 2)).max()), 1e-9))
 
     @cached_property
     def logs(self) -> Floats:

@@ -21,16 +21,16 @@ CLOCK_SHARE = 0.025
 _RATES = np.linspace(-0.012, 0.012, 13)
 """Clock errors to try around the known one."""
 
-_LEAST_SPACINGS = 6
+_MIN_SPACINGS = 6
 """Least spacings of successive characters to measure the clock by."""
 
 TAIL = 2 * TICKS
 """Ticks after a character that the windows of its bits may need."""
 
-LEAST_CHARACTERS = 3
+MIN_CHARACTERS = 3
 """Least characters to learn a light from."""
 
-_LEAST_MARGIN = 3.0
+_MIN_MARGIN = 3.0
 """Nats by which a stream's first characters must be likelier than the best path without them, odds of twenty:
 the bits before the first event are unknown, and any 0 may be a start bit."""
 
@@ -132,12 +132,12 @@ class CharacterReader:
         They are a few at most; the quality of later ones shows if light is dim.
         """
         scores = self._score_characters(evidence, light, False)
-        most = min(len(starts), LEAST_CHARACTERS - 1)
+        most = min(len(starts), MIN_CHARACTERS - 1)
         for many, start in enumerate(starts[:most].tolist()):
             # Beyond half a bit it is another character.
             other = scores.copy()
             other[max(start - TICKS // 2, 0) : start + TICKS // 2 + 1] = -np.inf
-            if score - self._find_best_path(other, evidence, stretch, light)[1] >= _LEAST_MARGIN:
+            if score - self._find_best_path(other, evidence, stretch, light)[1] >= _MIN_MARGIN:
                 return many
         return most
 
@@ -172,7 +172,7 @@ class CharacterReader:
         self, stretch: Stretch, light: Light, starts: Ticks, evidence: Floats, memory: float
     ) -> Light:
         """Return the light with what these characters teach."""
-        if len(starts) < LEAST_CHARACTERS:
+        if len(starts) < MIN_CHARACTERS:
             return light
         rate = self._estimate_rate(light, starts, evidence, memory)
         windows, contexts = self.extract_bits(
@@ -211,7 +211,7 @@ class CharacterReader:
         weight = memory * light.learned_bits
         gaps = np.diff(starts)
         at_once = np.abs(gaps - self.length * light.rate) <= NEAR + 1
-        if (many := int(at_once.sum())) >= _LEAST_SPACINGS:
+        if (many := int(at_once.sum())) >= _MIN_SPACINGS:
             # Their spacing shows the clock better than their edges do.
             runs = np.cumsum(~at_once)[at_once]
             spacings, ticks = np.bincount(runs), np.bincount(runs, gaps[at_once])
