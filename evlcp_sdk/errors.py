@@ -18,9 +18,12 @@ A recording of which much was dropped is no error, but ends a command with `DEGR
 warns of a broken plugin that is left out.
 """
 
+import traceback
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar
+
+from evlcp_sdk.formatting import format_safely, shorten
 
 
 class EvlcpError(Exception):
@@ -127,20 +130,30 @@ def explain_fault(fault: BaseException) -> tuple[str, int]:
     if isinstance(fault, EvlcpError):
         return str(fault), fault.exit_code
     if isinstance(fault, MemoryError):
-        return f"not enough memory: {_first_line(fault)}", _FAILURE
+        return f"not enough memory: {_short_message(fault)}", _FAILURE
     if isinstance(fault, OSError) and fault.filename is not None:
         return f"{fault.filename}: {fault.strerror}", _FAILURE
     return _report_line(fault), OWN_FAULT
 
 
-def _first_line(fault: BaseException) -> str:
-    text = " ".join(str(fault).split())
-    return text if len(text) <= 200 else f"{text[:200]}..."
+def describe_plugin_fault(fault: BaseException) -> str:
+    """What code of a plugin raised, in one line, with the file and line."""
+    last = traceback.extract_tb(fault.__traceback__)[-1]
+    line = f"{type(fault).__name__}: {format_safely(str, fault)}".splitlines()[0]
+    return f"{line} ({Path(last.filename).name}, line {last.lineno})"
+
+
+def fault_message(fault: BaseException) -> str:
+    """The message of an exception in one line; its type where it has none."""
+    return " ".join(str(fault).split()) or type(fault).__name__
+
+
+def _short_message(fault: BaseException) -> str:
+    return shorten(" ".join(str(fault).split()), 200)
 
 
 def _report_line(fault: BaseException) -> str:
     import platform
-    import traceback
     from importlib.metadata import version
 
     def place(frame: traceback.FrameSummary) -> str:
@@ -148,7 +161,7 @@ def _report_line(fault: BaseException) -> str:
 
     frames = traceback.extract_tb(fault.__traceback__)[-_MAX_PLACES:]
     return (
-        f"a fault of evlcp itself, not of what you gave: {type(fault).__name__}: {_first_line(fault)};"
+        f"a fault of evlcp itself, not of what you gave: {type(fault).__name__}: {_short_message(fault)};"
         " please report the command, what it was given, and this line:"
         f" evlcp-sdk {version('evlcp-sdk')}, Python {platform.python_version()}, {platform.platform()},"
         f" at {' > '.join(map(place, frames))}"

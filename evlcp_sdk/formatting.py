@@ -1,7 +1,7 @@
 """Numbers, values and text as messages and files show them; this imports nothing slow."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 
 def format_count(number: int, noun: str) -> str:
@@ -23,13 +23,10 @@ def round_or_none(value: float, digits: int) -> float | None:
     return round(value, digits) if math.isfinite(value) else None
 
 
-_MAX_SHOWN = 120
-
-
 def format_value(value: object) -> str:
     """A value as a message shows it, shortened where it is long."""
     text = to_toml_value(value) if isinstance(value, bool | int | float | str | list) else str(value)
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
+    return shorten(text, 120)
 
 
 def to_toml_value(value: object) -> str:
@@ -46,6 +43,19 @@ def to_toml_value(value: object) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(to_toml_value, value))}]"
     return repr(value)
+
+
+def shorten(text: str, length: int) -> str:
+    """The beginning of a text, with `...` where it is longer."""
+    return text if len(text) <= length else f"{text[:length]}..."
+
+
+def format_safely(form: Callable[[object], str], value: object) -> str:
+    """A value by `str` or `repr`, or by its type where that fails: integers of 5000 digits."""
+    try:
+        return form(value)
+    except Exception:
+        return f"a {type(value).__name__} that cannot be shown"
 
 
 def suggest(word: str, known: Sequence[str], kind: str = "known") -> str:

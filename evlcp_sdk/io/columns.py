@@ -14,7 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import InputError
+from evlcp_sdk.errors import InputError, fault_message
+from evlcp_sdk.formatting import shorten
 from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.io.fields import Polarities, RowError, TimeUnit, infer_time_unit
 from evlcp_sdk.plugin.source import EventSource, Loss
@@ -363,5 +364,4 @@ def _to_pixels(places: NDArray[Any]) -> NDArray[np.uint16]:
 
 def format_error(error: Exception) -> str:
     """Return the message of an error in one line."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 200 else f"{text[:200]}..."
+    return shorten(fault_message(error), 200)

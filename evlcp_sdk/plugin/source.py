@@ -1,6 +1,5 @@
 """Event sources, such as recordings, cameras and replays: streams of events with their losses."""
 
-import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
@@ -8,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self
 
-from evlcp_sdk.errors import EvlcpError, PluginError, StreamError
+from evlcp_sdk.errors import EvlcpError, PluginError, StreamError, describe_plugin_fault
 from evlcp_sdk.values import Events, Triggers
 
 DEFAULT_MAX_EVENTS = 1 << 18
@@ -206,9 +205,7 @@ class EventSource(ABC):
         except (Exception, SystemExit) as fault:
             if type(self).__module__.startswith("evlcp_sdk."):
                 raise
-            last = traceback.extract_tb(fault.__traceback__)[-1]
-            what = f"{type(fault).__name__}: {fault}".splitlines()[0]
-            raise self._plugin_error(f"{what} ({Path(last.filename).name}, line {last.lineno})") from fault
+            raise self._plugin_error(describe_plugin_fault(fault)) from fault
 
     def _plugin_error(self, what: str) -> PluginError:
         return PluginError(f"{self.path}: source {type(self).__name__}: {what}")

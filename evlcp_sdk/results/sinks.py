@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evlcp_sdk.errors import EvlcpError, PluginError
+from evlcp_sdk.errors import EvlcpError, PluginError, describe_plugin_fault
 from evlcp_sdk.files import writing
 from evlcp_sdk.plugin.records import InstalledSink
 from evlcp_sdk.results.folder import ResultFolder
@@ -116,7 +115,4 @@ class Sinks:
         except EvlcpError:
             raise
         except (Exception, SystemExit) as fault:
-            last = traceback.extract_tb(fault.__traceback__)[-1]
-            what = f"{type(fault).__name__}: {fault}".splitlines()[0]
-            where = f"{Path(last.filename).name}, line {last.lineno}"
-            raise PluginError(f"{installed}: {what} ({where})") from fault
+            raise PluginError(f"{installed}: {describe_plugin_fault(fault)}") from fault

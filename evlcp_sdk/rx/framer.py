@@ -9,8 +9,7 @@ from itertools import count
 from typing import Any, ClassVar
 
 from evlcp_sdk.clock import CameraClock, TimeStep
-from evlcp_sdk.errors import EvlcpError, PluginError
-from evlcp_sdk.rx.guard import fault_text
+from evlcp_sdk.errors import EvlcpError, PluginError, describe_plugin_fault
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.regions import TrackedRegion
 from evlcp_sdk.scene.attitude import Attitude
@@ -80,7 +79,8 @@ class Announcer:
         except EvlcpError:
             raise
         except (Exception, SystemExit) as fault:
-            raise PluginError(f"evlcp_stage_finished() of a plugin: {fault_text(fault)}") from fault
+            text = describe_plugin_fault(fault)
+            raise PluginError(f"evlcp_stage_finished() of a plugin: {text}") from fault
 
 
 SILENT = Announcer(None, float)

@@ -4,9 +4,6 @@ Kernels read and write by index, so that all values are checked before they see 
 """
 
 import math
-import traceback
-from collections.abc import Callable
-from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn
 
@@ -15,8 +12,8 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.errors import ConfigError, PluginError
-from evlcp_sdk.formatting import add_check_hint
+from evlcp_sdk.errors import ConfigError, PluginError, describe_plugin_fault
+from evlcp_sdk.formatting import add_check_hint, format_safely
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Filter, Tracker
 from evlcp_sdk.values import Curvature, PresenceMap, Range, SoftSymbols, SyncLock
@@ -79,7 +76,7 @@ class Guard:
             PluginError: Unless the fault may pass as it is.
         """
         if not isinstance(fault, self._allowed):
-            raise PluginError(self._error_text(f": {fault_text(fault)}")) from fault
+            raise PluginError(self._error_text(f": {describe_plugin_fault(fault)}")) from fault
 
     def refuse(self, gave: str, expected: str) -> NoReturn:
         """Raise an error with what the algorithm gave and what was expected."""
@@ -130,7 +127,7 @@ class Guard:
             fine = False
         if not fine:
             self.refuse(
-                f"{name} = {_format_safely(repr, found):.40}",
+                f"{name} = {format_safely(repr, found):.40}",
                 expected or f"a number from {least:g} to {most:g}",
             )
 
@@ -160,7 +157,7 @@ class Guard:
         self.expect(found, PresenceMap)
         grid = found.grid_px
         if not isinstance(grid, int | np.integer) or grid < 1:
-            self.refuse(f"grid_px = {_format_safely(repr, grid):.40}", "a whole number of pixels from 1")
+            self.refuse(f"grid_px = {format_safely(repr, grid):.40}", "a whole number of pixels from 1")
         cells = (clusters, height // grid, width // grid)
         self.expect_array(found.probability, "probability", cells, "f")
         self.expect_array(found.selected, "selected", cells, "b")
@@ -221,13 +218,6 @@ class Guard:
             self.refuse(f"values {values.tolist()!r:.40}", "finite ones")
         if not _is_nan(sigma):
             self.expect_number(sigma, "sigma", 0.0, math.inf)
-
-
-def fault_text(fault: BaseException) -> str:
-    """What code of a plugin raised, in one line, with the file and line."""
-    last = traceback.extract_tb(fault.__traceback__)[-1]
-    what = f"{type(fault).__name__}: {_format_safely(str, fault)}".splitlines()[0]
-    return f"{what} ({Path(last.filename).name}, line {last.lineno})"
 
 
 def compile_algorithm(link: Link, role: str, *arguments: object, methods: tuple[str, ...] = ()) -> Any:
@@ -297,11 +287,3 @@ def _is_nan(value: object) -> bool:
         return math.isnan(value)  # type: ignore[arg-type]
     except (TypeError, OverflowError):
         return False
-
-
-def _format_safely(form: Callable[[object], str], what: object) -> str:
-    """Format a value by `str` or `repr`, or by its type where that fails: integers of 5000 digits."""
-    try:
-        return form(what)
-    except Exception:
-        return f"a {type(what).__name__} that cannot be shown"

@@ -5,6 +5,7 @@ import errno
 import time
 from typing import Any
 
+from evlcp_sdk.errors import fault_message
 from firmware_host.errors import LineError, NoBoardError
 
 _ABSENT_ADVICE = "it is not there; plug it in, or find it with 'evlcp board ports'"
@@ -75,24 +76,20 @@ class SerialTransport:
 
     def _line_error(self, fault: Exception) -> LineError:
         return LineError(
-            f"{self.name}: the line broke: {_describe_fault(fault)}; plug it in and run the command again"
+            f"{self.name}: the line broke: {fault_message(fault)}; plug it in and run the command again"
         )
-
-
-def _describe_fault(fault: BaseException) -> str:
-    return " ".join(str(fault).split()) or type(fault).__name__
 
 
 def _explain_open_fault(url: str, baud: int, fault: Exception) -> str:
     scheme, on_network, _ = url.partition("://")
     if scheme in ("socket", "rfc2217"):
         return (
-            f"{_describe_fault(fault)}; expected {scheme}://HOST:PORT; start what listens there, or name"
+            f"{fault_message(fault)}; expected {scheme}://HOST:PORT; start what listens there, or name"
             " another --port"
         )
     advice = _ADVICE.get(getattr(fault, "errno", None))
     if advice is not None and not on_network:
         return advice.format(url)
     if "baud" in str(fault).lower():
-        return f"{_describe_fault(fault)}: its driver does not take --baud {baud}"
-    return f"{_describe_fault(fault)}; 'evlcp board ports' lists the ports"
+        return f"{fault_message(fault)}: its driver does not take --baud {baud}"
+    return f"{fault_message(fault)}; 'evlcp board ports' lists the ports"
