@@ -14,8 +14,7 @@ from board_lines import check_fault
 
 from evlcp_sdk.errors import ConfigError
 from firmware_host.errors import LineError, NoBoardError
-from firmware_host.ports.serial_port import SerialTransport
-from firmware_host.ports.transport import open_transport
+from firmware_host.ports.transport import SerialTransport, open_transport
 from firmware_host.ports.usb import UsbFilter, find_usb_device, serial_ports
 
 serial = pytest.importorskip("serial")
