@@ -77,19 +77,14 @@ def choose_site(path: Path, transmitter_id: int | None, option: str) -> BarSite:
     return chosen[0]
 
 
-def packet_s(link: Link) -> float:
-    """Duration of a packet on air, s."""
-    return link.packet.packet_chips / link.air.chip_rate_hz
-
-
 def check_interval(content: Content, link: Link, repeat: int, every_s: float) -> None:
     """Raise ConfigError if messages take longer on air than the period in which they are sent."""
     count = len(encode_messages(content.messages_at(link, clock_s(), 0), link.block_coder(), repeat))
-    takes_s = count * packet_s(link)
+    takes_s = count * (link.packet.packet_us / 1e6)
     if takes_s > every_s:
         raise ConfigError(
             f"--every {every_s:g}: what is to be sent takes {takes_s:.4g} s on air,"
-            f" {count} packets of {1e3 * packet_s(link):.4g} ms;"
+            f" {count} packets of {link.packet.packet_us / 1e3:.4g} ms;"
             f" give --every {ceil(takes_s)} or more, or send less"
         )
 

@@ -23,15 +23,13 @@ class SurveyedPort:
     fault: str
 
 
-def survey_ports(
-    baud: int, ports: list[SerialPort] | None = None, usb: UsbFilter | None = None, every: bool = False
-) -> list[SurveyedPort]:
+def survey_ports(baud: int, usb: UsbFilter | None = None, every: bool = False) -> list[SurveyedPort]:
     """List serial ports, all or with a USB id, and send HELLO at once to those that may have a board.
 
     Nothing is written to a port unless its USB id is given, or that of a bridge that boards usually have, as
     any other device may be there; `every` sends to all listed ports.
     """
-    listed = [p for p in (serial_ports() if ports is None else ports) if usb is None or usb.matches(p)]
+    listed = [p for p in serial_ports() if usb is None or usb.matches(p)]
     if not listed:
         return []
 
@@ -49,13 +47,13 @@ def survey_ports(
         return list(pool.map(probe, listed))
 
 
-def find_board_port(baud: int, ports: list[SerialPort] | None = None) -> str:
+def find_board_port(baud: int) -> str:
     """The port of the only board that answers.
 
     Raises:
         NoBoardError: None answers, or several do.
     """
-    found = survey_ports(baud, ports)
+    found = survey_ports(baud)
     boards = [f for f in found if f.info is not None]
     if len(boards) == 1:
         return boards[0].port.device

@@ -96,7 +96,7 @@ def ports(
     line: BoardLine = context.obj
     wanted = None if usb is None else UsbFilter.parse(usb)
     if ask:
-        found = survey_ports(line.baud, None, wanted, every)
+        found = survey_ports(line.baud, wanted, every)
     else:
         listed = [p for p in serial_ports() if wanted is None or wanted.matches(p)]
         found = [SurveyedPort(p, False, None, "not asked") for p in listed]

@@ -253,7 +253,6 @@ def _encode_content(content: Content, link: Link, repeat: int) -> tuple[NDArray[
     from time import time as clock_s
 
     from evlcp_sdk.link.compose import encode_messages
-    from firmware_host.board.messages import packet_s
 
     messages = content.messages_at(link, clock_s())
     symbols = encode_messages(messages, link.block_coder(), repeat)
@@ -268,7 +267,7 @@ def _encode_content(content: Content, link: Link, repeat: int) -> tuple[NDArray[
             for m in messages
         ],
         "packets": len(symbols),
-        "duration_s": round(len(symbols) * packet_s(link), 6),
+        "duration_s": round(len(symbols) * (link.packet.packet_us / 1e6), 6),
     }
 
 

@@ -278,17 +278,20 @@ def test_pty_and_tcp(evlcp, tmp_path):
     assert emulated.end() == 0
 
 
-def test_ports_are_asked(native, tmp_path):
+def test_ports_are_asked(native, tmp_path, monkeypatch):
     silent, other = pty.openpty()
     tty.setraw(other)
     listed = [SerialPort(p, usb="0403:6015") for p in (os.ttyname(other), native, "/dev/nowhere")]
-    assert [f.info is not None for f in survey_ports(1_000_000, listed)] == [False, True, False]
-    assert find_board_port(1_000_000, listed) == native
+    monkeypatch.setattr("firmware_host.board.survey.serial_ports", lambda: listed)
+    assert [f.info is not None for f in survey_ports(1_000_000)] == [False, True, False]
+    assert find_board_port(1_000_000) == native
+    board = listed.pop(1)
     with pytest.raises(NoBoardError, match=r"no board answers on any serial port .*asked: .*, /dev/nowhere;"):
-        find_board_port(1_000_000, [listed[0], listed[2]])
+        find_board_port(1_000_000)
     second = Native(f"unix:{tmp_path / 'second'}")
+    listed[:] = board, SerialPort(f"unix:{tmp_path / 'second'}", usb="0403:6015")
     with pytest.raises(NoBoardError, match="2 boards answer"):
-        find_board_port(1_000_000, [listed[1], SerialPort(f"unix:{tmp_path / 'second'}", usb="0403:6015")])
+        find_board_port(1_000_000)
     second.end()
     os.close(silent)
     os.close(other)
