@@ -13,40 +13,37 @@ from numpy.typing import NDArray
 CRC_BITS = 24
 """Bits of the check."""
 
-CRC24C = 0xB2B117
+_CRC24C = 0xB2B117
 """The polynomial without its x^24, highest power in the highest bit."""
 
 _ONES = 0xFFFFFF
 
 
-def crc24(bits: NDArray[np.uint8], polynomial: int = CRC24C, start: int = _ONES) -> NDArray[np.uint8]:
+def crc24(bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The 24 check bits of a message, uint8 (24,), in the order in which they are sent.
 
-    Args:
-        bits: The message, uint8 (n,), 0 or 1, in the order in which it is sent.
-        polynomial: Generator without its x^24.
-        start: The register before the first bit.
+    `bits` is the message, uint8 (n,), 0 or 1, in the order in which it is sent.
 
     >>> "".join(map(str, crc24(np.ones(8, np.uint8))))
     '111111111111111100000000'
     """
-    register, odd = start, len(bits) % 8
+    register, odd = _ONES, len(bits) % 8
     for bit in bits[:odd].tolist():
-        register = _shift(register ^ bit << 23, polynomial)
-    by_byte = _remainders(polynomial)
+        register = _shift(register ^ bit << 23)
+    by_byte = _remainders()
     for byte in np.packbits(bits[odd:]).tolist():
         register = (register << 8 & _ONES) ^ by_byte[register >> 16 ^ byte]
     return np.array([register >> i & 1 for i in range(CRC_BITS - 1, -1, -1)], np.uint8)
 
 
-def _shift(register: int, polynomial: int) -> int:
-    return (register << 1 & _ONES) ^ (polynomial if register >> 23 else 0)
+def _shift(register: int) -> int:
+    return (register << 1 & _ONES) ^ (_CRC24C if register >> 23 else 0)
 
 
 @cache
-def _remainders(polynomial: int) -> list[int]:
+def _remainders() -> list[int]:
     """The register after each byte, from a register of zeros."""
     registers = [byte << 16 for byte in range(256)]
     for _ in range(8):
-        registers = [_shift(register, polynomial) for register in registers]
+        registers = [_shift(register) for register in registers]
     return registers

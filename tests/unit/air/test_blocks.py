@@ -114,8 +114,11 @@ def test_beacons_keep_every_digit(latitude, longitude, height, heading, tilt, le
 NINE = np.unpackbits(np.frombuffer(b"123456789", np.uint8))
 
 
-def value(bits: np.ndarray) -> int:
-    return int("".join(map(str, bits)), 2)
+def divide(bits: np.ndarray, polynomial: int, start: int) -> int:
+    """The register after a message, bit by bit."""
+    for bit in bits.tolist():
+        start = (start << 1 & 0xFFFFFF) ^ (polynomial if start >> 23 ^ bit else 0)
+    return start
 
 
 @pytest.mark.parametrize(
@@ -129,12 +132,10 @@ def value(bits: np.ndarray) -> int:
     ids=["OpenPGP", "LTE-A", "LTE-B", "Interlaken, which sends it inverted"],
 )
 def test_published_check_values(polynomial: int, start: int, check: int) -> None:
-    got = value(crc24(NINE, polynomial, start))
-    assert got == check, hex(got)
+    assert divide(NINE, polynomial, start) == check
 
 
-@pytest.mark.parametrize("bits", range(1, 18))
+@pytest.mark.parametrize("bits", [*range(1, 18), 72])
 def test_a_message_need_not_fill_its_bytes(bits: int) -> None:
-    """Zeros before it say nothing to a register of zeros."""
-    message = np.ones(bits, np.uint8)
-    assert value(crc24(message, start=0)) == value(crc24(np.pad(message, (-bits % 8, 0)), start=0))
+    register = divide(NINE[:bits], 0xB2B117, 0xFFFFFF)
+    assert "".join(map(str, crc24(NINE[:bits]))) == f"{register:024b}"
