@@ -211,7 +211,7 @@ def point_information(seen: Scene) -> Floats:
         points, slope = project_bars(view.enu_m, np.zeros(3), seen.rotation, seen.camera)
         weight = 1 / view.sigma_px[:, None, None]
         arm, by = view.enu_m - view.enu_m.mean(0), -slope[:, :, :3]
-        place, turn, length = view.survey
+        place, turn, length = view.survey_sigmas
         rows = np.zeros((len(points), 2, 6 + shared))
         rows[:, :, :6] = slope
         away = points - np.array(seen.camera.centre_px)

@@ -58,10 +58,9 @@ def calibrate(
             known = []
             for number, view in views_of.items():
                 if (site := bars.known_sites.get(number)) is not None:
-                    enu_m = site.layout_positions_m(link.bar, axes)
-                    known.append(
-                        replace(view, transmitter=site.transmitter_id, enu_m=enu_m, survey=site.survey_sigmas)
-                    )
+                    enu = site.layout_positions_m(link.bar, axes)
+                    placed = replace(view, enu_m=enu, survey_sigmas=site.survey_sigmas)
+                    known.append(replace(placed, transmitter=site.transmitter_id))
             views.append(_make_view(pose, known, axes))
     return fit_camera(views, link.camera, ErrorModel.of(link.position), limit_px=limit_px)
 

@@ -273,7 +273,7 @@ class WhitenedView:
     bar: NDArray[np.int64]
     arm_m: Floats
     curvature_px: Floats
-    survey: Mapping[int, tuple[float, float, float]]
+    bar_sigmas: Mapping[int, tuple[float, float, float]]
     place_m: Floats
     place_sigma_m: float
     rotation: Floats
@@ -282,7 +282,7 @@ class WhitenedView:
     @classmethod
     def of(cls, view: CalibrationView, camera: CameraModel, spec: ErrorModel) -> "WhitenedView | None":
         """The points of the bars with enough of them; None if there is none."""
-        columns, whiten, survey = [], [], {}
+        columns, whiten, bar_sigmas = [], [], {}
         vibration = common_vibration(view.bars)
         for bar in view.bars:
             usable = np.isfinite(bar.points_px).all(1) & (bar.sigma_px > 0)
@@ -292,8 +292,8 @@ class WhitenedView:
             curvature = spec.curvature_sigma_px * _curvature_slopes(bar.enu_m, usable, bar.points_px)
             columns.append((bar.enu_m[usable], bar.points_px[usable], number, arm, curvature))
             shared = compute_shared_errors(bar, usable, spec, vibration)
-            place, turn, length = shared.survey.tolist()
-            survey[bar.transmitter] = place, turn, length
+            place, turn, length = shared.bar_sigmas.tolist()
+            bar_sigmas[bar.transmitter] = place, turn, length
             # The largest in any direction.
             shift = float(np.linalg.eigvalsh(shared.root)[-1])
             covariance = np.diag((max(bar.across, 1.0) * bar.sigma_px[usable]) ** 2) + shift**2
@@ -309,7 +309,7 @@ class WhitenedView:
             directions = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (enu - view.enu_m, seen_at)]
             rotation, sigma = Rotation.align_vectors(*directions)[0].as_matrix(), _FREE_SIGMA_RAD
         camera_at = view.enu_m, view.position_sigma_m, rotation, sigma
-        return cls(enu, points, block_diag(*whiten), numbers, arms, curves, survey, *camera_at)
+        return cls(enu, points, block_diag(*whiten), numbers, arms, curves, bar_sigmas, *camera_at)
 
 
 def _curvature_slopes(enu_m: Floats, seen: NDArray[np.bool_], points_px: Floats) -> Floats:
@@ -422,7 +422,7 @@ def solve_views(
     """Solve the least squares of all views, from `camera` on; other arguments are as of `_ViewModel`."""
     surveys: dict[int, tuple[float, float, float]] = {}
     for view in views:
-        surveys |= {n: sigma for n, sigma in view.survey.items() if any(sigma) or view.curvature_px.any()}
+        surveys |= {n: s for n, s in view.bar_sigmas.items() if any(s) or view.curvature_px.any()}
     model = _ViewModel(views, camera, root, common, surveys)
 
     def residuals_of(x: Floats) -> Floats:
@@ -443,9 +443,9 @@ def solve_views(
     return ViewSolution(model.camera_of(x), x, covariance, slices, misfit)
 
 
-def _site_slope(arm_m: Floats, survey: tuple[float, float, float]) -> Floats:
+def _site_slope(arm_m: Floats, bar_sigmas: tuple[float, float, float]) -> Floats:
     """Shifts of a bar's points, m, by sigmas of its site's place, rotation and length, float64 (n, 3, 7)."""
-    place, turn, length = survey
+    place, turn, length = bar_sigmas
     moves = np.zeros((len(arm_m), 3, 7))
     moves[:, :, :3] = place * np.eye(3)
     moves[:, :, 3:6] = turn * np.cross(np.eye(3)[None], arm_m[:, None]).transpose(0, 2, 1)

@@ -310,8 +310,8 @@ def linearize(problem: Problem, state: FitState) -> Equations | None:
     """Linearize the problem at a state; None where a point is behind the camera."""
     huber = problem.spec.huber_sigmas
     points, local = problem.points, state.local[problem.bar]
-    survey, root, whitening = (errors[problem.bar] for errors in problem.errors)
-    place_sigma, turn_sigma, by_length = survey[:, :1], survey[:, 1:2], survey[:, 2:3] * points[:, 3:6]
+    sigmas, root, whitening = (errors[problem.bar] for errors in problem.errors)
+    place_sigma, turn_sigma, by_length = sigmas[:, :1], sigmas[:, 1:2], sigmas[:, 2:3] * points[:, 3:6]
     arm_cross = cross_matrices(points[:, 3:6])
     offset = points[:, :3] - state.position + place_sigma * local[:, 3:6] + local[:, 2:3] * by_length
     offset += _multiply_each(turn_sigma * local[:, 6:9], arm_cross)

@@ -369,8 +369,9 @@ def _name_moves(problem: Problem, camera: Floats, attitude: Floats, bars: Floats
         standing["camera"] = camera
     if problem.attitude is not None and problem.free[3:6].any():
         standing["attitude"] = attitude
-    for moves, survey, number in zip(bars, problem.errors.survey.tolist(), problem.transmitters, strict=True):
-        if any(survey):
+    bar_sigmas = problem.errors.bar_sigmas.tolist()
+    for moves, sigmas, number in zip(bars, bar_sigmas, problem.transmitters, strict=True):
+        if any(sigmas):
             # Length, true and apparent; place and rotation where these have a sigma.
-            standing[f"bar {number}"] = moves if any(survey[:2]) else moves[:, :1].copy()
+            standing[f"bar {number}"] = moves if any(sigmas[:2]) else moves[:, :1].copy()
     return standing

@@ -75,8 +75,7 @@ class BarView:
         enu_m: Centres of its clusters in the local axes, m, float64 (K, 3).
         points_px: Where they are seen, px, float64 (K, 2); NaN where unseen.
         sigma_px: Their standard deviations along the bar, px, float64 (K,).
-        survey: Sigmas of the bar's place, m, of its rotation about each axis, radians, and of its length, as
-            a share; 0: exact.
+        survey_sigmas: Of the bar's place, m, turn about each axis, radians, and length, a share; 0: exact.
         pixel_px: The part of `sigma_px` that persists until the image has moved; None for
             `ErrorModel.pixel_sigma_px`.
         shift_px: Error that all points share across the bar besides `ErrorModel.shared_sigma_px`, px.
@@ -90,7 +89,7 @@ class BarView:
     enu_m: Floats
     points_px: Floats
     sigma_px: Floats
-    survey: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    survey_sigmas: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pixel_px: float | None = None
     shift_px: float = 0.0
     vibration: float = 1.0
@@ -144,13 +143,12 @@ class SharedErrors(NamedTuple):
     """Errors that the points of a bar share, and whitening of their own; of several bars, arrays of these.
 
     Attributes:
-        survey: Sigmas of the bar's place, m, its rotation, radians, and its true and apparent length, as a
-            share, float64 (3,).
+        bar_sigmas: Of its place, m, rotation, radians, and true and apparent length, a share, float64 (3,).
         root: A root of the covariance of its image's shift, px, float64 (2, 2).
         whitening: Makes errors of a point, in its sigmas, isotropic and of sigma 1, float64 (2, 2).
     """
 
-    survey: Floats
+    bar_sigmas: Floats
     root: Floats
     whitening: Floats
 
@@ -335,7 +333,7 @@ class Problem:
     @cached_property
     def has_survey_errors(self) -> bool:
         """Whether places or attitudes of bars have errors."""
-        return bool(self.errors.survey[:, :2].any())
+        return bool(self.errors.bar_sigmas[:, :2].any())
 
 
 def common_vibration(views: Sequence[BarView]) -> float:
@@ -385,7 +383,7 @@ def compute_shared_errors(
     across_px = math.hypot(spec.shared_sigma_px, view.shift_px, shift_px) if is_line else along_px
     weight_across = 1 / view.across if is_line else 1 / max(view.across, 1.0)
     weight_along = 1.0 if is_line else weight_across
-    (x, y), (place, turn, length) = axis.tolist(), view.survey
+    (x, y), (place, turn, length) = axis.tolist(), view.survey_sigmas
     projection = np.array([[x * x, x * y], [x * y, y * y]])
     return SharedErrors(
         np.array([place, turn, math.hypot(length, spec.stretch_share, view.stretch)]),

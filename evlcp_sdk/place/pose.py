@@ -166,7 +166,7 @@ def estimate_fault(problem: Problem, bar: int, pose: Pose, test: float, parts: i
         residuals = (weight @ (rows[:, 6:8] - points)[:, :, None]).ravel()
         gain = np.linalg.solve(by_place.T @ weights @ by_place, by_place.T @ weights)
         off_m = off_m + gain @ residuals
-    site_sigma_m = problem.errors.survey[bar, 0]
+    site_sigma_m = problem.errors.bar_sigmas[bar, 0]
     by_camera = gain @ by_pose
     covariance = gain @ np.linalg.inv(weights) @ gain.T + by_camera @ pose.covariance @ by_camera.T
     covariance = covariance + site_sigma_m**2 * np.eye(3)
@@ -218,8 +218,8 @@ def _find_exchanged_sites(
     found = []
     for i, j in combinations(range(len(views)), 2):
         one, other, exchanged = views[i], views[j], list(views)
-        exchanged[i] = replace(one, enu_m=other.enu_m, survey=other.survey)
-        exchanged[j] = replace(other, enu_m=one.enu_m, survey=one.survey)
+        exchanged[i] = replace(one, enu_m=other.enu_m, survey_sigmas=other.survey_sigmas)
+        exchanged[j] = replace(other, enu_m=one.enu_m, survey_sigmas=one.survey_sigmas)
         problem = problem_of(exchanged)
         pose = _fit_if_consistent(problem) if isinstance(problem, Problem) else None
         if isinstance(pose, Pose):

@@ -167,7 +167,7 @@ class Positioner:
             self.axes = self.axes or bar_axes
             try:
                 enu = site.layout_positions_m(kind.bar, bar_axes)
-                placed.append(replace(view, enu_m=enu, survey=site.survey_sigmas))
+                placed.append(replace(view, enu_m=enu, survey_sigmas=site.survey_sigmas))
             except ConfigError as error:
                 unplaced.append(str(error))
         if not views:

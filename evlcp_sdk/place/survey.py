@@ -241,6 +241,6 @@ def _place_bars(
         clusters = len(bar.points_px)
         along_m = (0.5 - (np.arange(clusters) + 0.5) / clusters) * length_m[bar.transmitter]
         centre, axis = lines[bar.transmitter]
-        survey = (_PLACE_M, _TURN_RAD, 0.0)
-        bars.append(replace(bar, enu_m=centre + along_m[:, None] * axis, survey=survey))
+        sigmas = (_PLACE_M, _TURN_RAD, 0.0)
+        bars.append(replace(bar, enu_m=centre + along_m[:, None] * axis, survey_sigmas=sigmas))
     return replace(view, bars=tuple(bars))

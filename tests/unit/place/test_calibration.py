@@ -79,7 +79,7 @@ def test_sites_that_are_not_exact_are_in_the_covariance() -> None:
             for one in view.bars:
                 z, arm = off[one.transmitter], one.enu_m - one.enu_m.mean(0)
                 moved = survey[0] * z[:3] + np.cross(survey[1] * z[3:6], arm) + survey[2] * z[6] * arm
-                bars.append(dataclasses.replace(one, enu_m=one.enu_m + moved, survey=survey))
+                bars.append(dataclasses.replace(one, enu_m=one.enu_m + moved, survey_sigmas=survey))
             reports.append(dataclasses.replace(view, bars=tuple(bars)))
         found = fit_camera(reports, NOMINAL, POINTS_ONLY)
         exact = fit_camera(seen, NOMINAL, POINTS_ONLY)

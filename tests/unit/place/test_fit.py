@@ -311,7 +311,7 @@ def test_what_points_share_grows_with_the_whole_layout(layout, length_m, dark) -
     found = compute_shared_errors(view, seen, spec, 1.0)
     longest = math.hypot(0.05, 0.002 * 250 * length_m)
     assert np.linalg.eigvalsh(found.root)[-1] == pytest.approx(longest, rel=1e-9)
-    assert found.survey == pytest.approx([0.1, 0.2, 0.005])
+    assert found.bar_sigmas == pytest.approx([0.1, 0.2, 0.005])
 
 
 def test_protection_levels_hold_with_any_bar_at_fault() -> None:

@@ -64,7 +64,7 @@ def draw_scene(
         longways = math.hypot(spec.shared_along_px, spec.shared_share * float(whole @ along) * 16 / 15)
         points = view.points_px + rng.normal(0, longways) * along + gap * shaken
         points = points + rng.normal(0, spec.shared_sigma_px) * np.array([-along[1], along[0]])
-        seen.append(replace(view, enu_m=result, points_px=points, survey=survey, vibration=gap))
+        seen.append(replace(view, enu_m=result, points_px=points, survey_sigmas=survey, vibration=gap))
     reported = None
     if known is not None:
         # A bias of each angle, an offset in time that moves all of them, and noise.
