@@ -20,6 +20,7 @@ from scipy.special import j0, j1
 from scipy.stats import binomtest, chi2, norm
 
 from evlcp_sdk.io import read_events
+from evlcp_sdk.report.drawing import INK_COLOUR, set_heading, style_axes
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
@@ -54,14 +55,13 @@ from tests.models.truths import scene_of_truth
 SHARED = Path(__file__).parents[3] / "shared" / "recordings"
 SENSOR = SensorSpec()
 IDEAL = replace(SENSOR, noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)
-ON, OFF, INK = "#d55e00", "#0072b2", "#333333"
+ON, OFF, INK = "#d55e00", "#0072b2", INK_COLOUR
 
 
-def plain(axis: Axes, title: str, x: str, y: str) -> None:
-    axis.set_title(title, loc="left", fontsize=10, color=INK)
+def label_axes(axis: Axes, title: str, x: str, y: str) -> None:
+    set_heading(axis, title)
+    style_axes(axis)
     axis.set(xlabel=x, ylabel=y)
-    for side in ("top", "right"):
-        axis.spines[side].set_visible(False)
 
 
 def draw_latency(axis: Axes) -> None:
@@ -74,7 +74,7 @@ def draw_latency(axis: Axes) -> None:
             label=f"{name}, measured",
         )  # fmt: skip
     axis.legend(frameon=False, fontsize=8)
-    plain(axis, "latency of the first event", "light, W/m2", "us")
+    label_axes(axis, "latency of the first event", "light, W/m2", "us")
     print("| W/m2 | ON us | measured | OFF us | measured |\n|---|---|---|---|---|")
     for light, (on, off) in MEASURED_LATENCY.items():
         a, b = latency_us(SENSOR, light, SENSOR.dark_w_m2)
@@ -93,7 +93,7 @@ def draw_area(axis: Axes) -> None:
         print(f"area, {row_us} us a row: {counts}")
     axis.plot(sides, list(MEASURED_AREA.values()), "o", color=INK, ms=4, label="measured")
     axis.legend(frameon=False, fontsize=8)
-    plain(axis, "latency of a lit square, 0.277 W/m2", "side, px", "us")
+    label_axes(axis, "latency of a lit square, 0.277 W/m2", "side, px", "us")
 
 
 def draw_edges(axis: Axes) -> None:
@@ -104,7 +104,7 @@ def draw_edges(axis: Axes) -> None:
     )
     axis.plot(contrast, found, ".", color=ON, label="simulated")
     axis.legend(frameon=False, fontsize=8)
-    plain(axis, "events of a slow, noiseless edge", "ln contrast", "events")
+    label_axes(axis, "events of a slow, noiseless edge", "ln contrast", "events")
 
 
 def draw_s_curve(axis: Axes) -> None:
@@ -115,7 +115,7 @@ def draw_s_curve(axis: Axes) -> None:
     axis.plot(contrast, norm.cdf((contrast - SENSOR.th_on) / sigma), color=INK, label="normal distribution")
     axis.errorbar(contrast, share, np.abs(bounds.T - share), fmt=".", color=ON, lw=1, label="simulated, 95 %")
     axis.legend(frameon=False, fontsize=8)
-    plain(axis, "share of pixels that answer a step", "ln contrast", "")
+    label_axes(axis, "share of pixels that answer a step", "ln contrast", "")
 
 
 def draw_asymmetry(axis: Axes) -> None:
@@ -130,7 +130,7 @@ def draw_asymmetry(axis: Axes) -> None:
         on = int(events.on.sum())
         counts.append((len(events.on) - on) / max(on, 1))
     axis.semilogx(lights, counts, ".-", color=OFF)
-    plain(axis, "OFF events for one ON event, chips at 20 W/m2", "background, W/m2", "")
+    label_axes(axis, "OFF events for one ON event, chips at 20 W/m2", "background, W/m2", "")
 
 
 def draw_intervals(axis: Axes) -> None:
@@ -140,7 +140,7 @@ def draw_intervals(axis: Axes) -> None:
     gaps = np.diff(events.request_us)[np.diff(events.pixel) == 0]
     axis.hist(gaps, np.arange(0, 121, 1), color=OFF)
     axis.axvline(SENSOR.refr_us, color=INK, lw=1)
-    plain(axis, f"intervals in a pixel; refractory time {SENSOR.refr_us:g} us", "us", "events")
+    label_axes(axis, f"intervals in a pixel; refractory time {SENSOR.refr_us:g} us", "us", "events")
     print(f"shortest interval {gaps.min():.3f} us, refractory time {SENSOR.refr_us:g} us")
 
 
@@ -246,15 +246,15 @@ def draw_scene(figure: Figure) -> None:
     x, y = (int(np.median(v)) for v in (events.x, events.y))
     image.imshow(
         np.log1p(counts[y - 90 : y + 90, x - 25 : x + 25]), cmap="Greys", interpolation="nearest",
-        extent=(x - 25.5, x + 24.5, y + 89.5, y - 90.5),
+        extent=(x - 25.5, x + 24.5, y + 89.5, y - 90.5), zorder=1,
     )  # fmt: skip
-    plain(image, "events of 20 ms, 50 m ahead", "column, px", "row, px")
+    label_axes(image, "events of 20 ms, 50 m ahead", "column, px", "row, px")
     shown = (events.t_us >= 8000) & (events.t_us < 10_000)
     for on, colour in ((1, ON), (0, OFF)):
         some = shown & (events.p == on)
         chips.plot(events.t_us[some] / 1e3, events.y[some], ",", color=colour)
     chips.set(ylim=(y + 90, y - 90))
-    plain(chips, "the same, ON red, OFF blue", "ms", "row, px")
+    label_axes(chips, "the same, ON red, OFF blue", "ms", "row, px")
 
 
 def main() -> None:
