@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from firmware_host import build
 from firmware_host.emulators.led_record import RECORD, LedRecord
 from firmware_host.ports.transport import Transport
-from firmware_host.protocol.generated.requests import LEDS, ROW_BYTES
+from firmware_host.protocol.generated.requests import ROW_BYTES
 
 
 class _Health(ctypes.Structure):
@@ -113,10 +113,6 @@ class SimulatedBoard:
         """Write the flash with the slots of SAVE, and reset the board."""
         ctypes.memmove(self.bench.flash, content, self.bench.flash_bytes)
         self.reset()
-
-    def lit_leds(self) -> NDArray[np.uint8]:
-        """State of the LEDs now, uint8 (96,)."""
-        return np.unpackbits(np.array(self.bench.shown, np.uint8))[:LEDS]
 
 
 class SimulatedLine(Transport):

@@ -205,7 +205,7 @@ def test_what_the_firmware_refuses(device, board):
         board.session.call(protocol.StreamRequest(0, Format.CLUSTERS, commit.digest))
     board.prepare_commit(bank)
     device.run(10_000)
-    assert not device.lit_leds().any()
+    assert not any(device.bench.shown)
 
 
 def test_what_hello_says_decides(board):
@@ -336,7 +336,7 @@ def test_a_stream_rests_while_nothing_is_sent(serial, device, board):
     assert sent.sum() == 4
     assert np.flatnonzero(sent)[0] >= 3, "it rests from the first chip on"
     assert sent[-3:].all(), "behind one another"
-    assert not device.lit_leds().any()
+    assert not any(device.bench.shown)
 
 
 def test_what_would_be_characters_is_refused(serial, board):

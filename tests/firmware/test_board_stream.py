@@ -57,7 +57,7 @@ def test_packets_follow_without_a_gap(device, link, latency_s, ahead):
     assert (stream.underruns, stream.sent) == (0, 30)
     pieces = -(-link.packet.frames * 32 // (512 - protocol.PushRequest.min_bytes()))
     assert stream.requests <= 30 * pieces + 3
-    assert not device.lit_leds().any()
+    assert not any(device.bench.shown)
 
 
 def test_an_empty_queue_is_named_and_shows_the_idle_pattern(device):
@@ -113,7 +113,7 @@ def test_the_watchdog_acts_on_a_stream_whose_host_is_gone(device, board):
     stream.wait(1.0)
     assert status_of(stream).state == State.IDLE_PATTERN
     device.run(500_000)
-    assert not device.lit_leds().any()
+    assert not any(device.bench.shown)
 
 
 def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_reported(device, board):
@@ -121,7 +121,7 @@ def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_reported(device, board):
         for packet in symbols_of(4):
             stream.send(packet)
         raise KeyError("x")
-    assert not device.lit_leds().any()
+    assert not any(device.bench.shown)
     assert board.status().packets_sent < 4
     stream = board.stream(LINK)
     device.reset()
