@@ -29,7 +29,9 @@ _CLOCK_SHIFT, _TICK_MASK = np.uint32(CLOCK_BIT), np.uint32(CLOCK_TICKS - 1)
 _CLOCK_MASK = np.uint32((1 << 32) - (1 << CLOCK_BIT))
 _BELOW_CLOCK, _BELOW_REPEATS = np.uint32((1 << CLOCK_BIT) - 1), np.uint32((1 << REPEATS_BIT) - 1)
 
-_REPEATS = np.add.outer([-6, 1, -2, 2], np.arange(MAX_REPEATS + 1)).clip(0, MAX_REPEATS).astype(np.uint32)
+_REPEATS = (
+    np.add.outer([-6, 1, -2, 2], np.arange(MAX_REPEATS + 1)).clip(0, MAX_REPEATS).astype(np.uint32).ravel()
+)
 """Repetitions after each kind of time and number of them before. A kind counts by the logarithm of how much
 likelier it is of a lamp that misses one rise in ten than of the code of a cluster whose pilot repeats itself,
 in units of that of a repetition, a third."""
@@ -112,7 +114,7 @@ def score_rises(
         kind = np.uint32(kinds[runs[i]])
         low = np.uint32(transitions[(kind << np.uint32(REPEATS_BIT)) | (state & _BELOW_REPEATS)])
         same = (state >> np.uint32(REPEATS_BIT)) & np.uint32(MAX_REPEATS)
-        same = _REPEATS[low >> np.uint32(REPEATS_BIT), same]
+        same = _REPEATS[(low >> np.uint32(REPEATS_BIT) << np.uint32(CLOCK_BIT - REPEATS_BIT)) | same]
         states[at] = (state & _CLOCK_MASK) | (same << np.uint32(REPEATS_BIT)) | (low & _BELOW_REPEATS)
         # A rise after a long time is no blinking yet, however a pixel blinked when a bar was there.
         if (low & np.uint32(SCORE_MASK)) >= least and kind != np.uint32(0) and same < lamp:

@@ -63,6 +63,8 @@ class Announcer:
 
     def announce(self, stage: str, value: object) -> None:
         """Announce what took the time since the last announcement."""
+        if self._hook is None:
+            return
         now = time.perf_counter()
         elapsed_s, self._lap_s = now - self._lap_s, now
         self._call_hook(stage, value, elapsed_s)

@@ -4,7 +4,6 @@ import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Collection, Sequence
-from copy import copy
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, Final, NamedTuple
@@ -79,6 +78,7 @@ class RegionTrack:
 
     Attributes:
         latest: The newest.
+        previous: The one before it; the same where there is no other.
 
     >>> track = RegionTrack([Region(0, 0.0, 5.0, 7.0, 4.0, 9.0), Region(0, 100.0, 6.0, 7.0, 4.0, 9.0)])
     >>> len(track), track.centre_at(50.0), track.centre_at(1000.0), track.size_at(70.0)
@@ -102,19 +102,13 @@ class RegionTrack:
         sample = region.t_us, region.x_px, region.y_px, region.width_px, region.height_px
         self._columns[:, self._end] = sample
         self._end += 1
-        self.latest = region
-
-    @property
-    def previous(self) -> Region:
-        """The one before the newest; the same where there is no other."""
-        if len(self) == 1:
-            return self.latest
-        return make_region(self.latest.id, *self._columns[:, self._end - 2].tolist())
+        self.previous, self.latest = self.latest, region
 
     def drop_latest(self) -> None:
         """Undo the last `append`."""
-        self.latest = self.previous
         self._end -= 1
+        self.latest = self.previous
+        self._find_previous()
 
     def forget_before(self, t_us: float) -> None:
         """Drop those older than a time, except the newest of them; the last two stay."""
@@ -145,7 +139,8 @@ class RegionTrack:
                 of the excess: the row within that which is nearest to `row_px` is taken.
             drift_us: Times from and to which the shift grows evenly from 0; samples before the first stay.
         """
-        track = copy(self)
+        track = object.__new__(RegionTrack)
+        track._columns, track._first, track._end = self._columns, self._first, self._end
         track._reallocate()
         samples = track._samples()
         share: NDArray[np.float64] | float = 1.0
@@ -160,6 +155,7 @@ class RegionTrack:
                 samples[2] += np.minimum(np.maximum(row_px - samples[2], -slack_px), slack_px)
             samples[3], samples[4] = size_px
         track.latest = make_region(id, *samples[:, -1].tolist())
+        track._find_previous()
         return track
 
     def centres_at(
@@ -199,6 +195,11 @@ class RegionTrack:
             i -= 1
         width_px, height_px = self._columns[3:, i].tolist()
         return width_px, height_px
+
+    def _find_previous(self) -> None:
+        self.previous = self.latest
+        if len(self) > 1:
+            self.previous = make_region(self.latest.id, *self._columns[:, self._end - 2].tolist())
 
     def _samples(self) -> NDArray[np.float64]:
         """Times, columns, rows, widths and heights, float64 (5, n)."""
@@ -535,12 +536,19 @@ class RhythmTracker(RegionTracker):
 
     def _predict_boxes(self, t_us: float, occupied: Sequence[Region]) -> list[Box]:
         """The box of each region in the middle of a step; one of unknown size is kept clear of the others."""
-        boxes, others = [], [box_of(place) for place in occupied]
-        for region in self.alive:
-            x_px, y_px = self._predict_centre(region, t_us)
-            boxes.append(self._search_box(x_px, y_px, *self._swept_size(region)))
-            if region.size_px is not None:
-                others.append(box_around(x_px, y_px, region.latest.width_px, region.latest.height_px))
+        centres = [self._predict_centre(region, t_us) for region in self.alive]
+        boxes = [
+            self._search_box(*centre, *self._swept_size(region))
+            for region, centre in zip(self.alive, centres, strict=True)
+        ]
+        if all(region.size_px is not None for region in self.alive):
+            return boxes
+        others = [box_of(place) for place in occupied]
+        others += [
+            box_around(*centre, region.latest.width_px, region.latest.height_px)
+            for region, centre in zip(self.alive, centres, strict=True)
+            if region.size_px is not None
+        ]
         return [
             subtract_boxes(box, others) if region.size_px is None else box
             for region, box in zip(self.alive, boxes, strict=True)
@@ -548,8 +556,8 @@ class RhythmTracker(RegionTracker):
 
     def _swept_size(self, region: TrackedRegion) -> tuple[float, float]:
         """(width, height) that a region covers in a step, px."""
-        (right, down), step_us = region.velocity_px_us, self._spec.step_us
-        return region.latest.width_px + abs(right) * step_us, region.latest.height_px + abs(down) * step_us
+        last, (right, down), step_us = region.track.latest, region.velocity_px_us, self._spec.step_us
+        return last.width_px + abs(right) * step_us, last.height_px + abs(down) * step_us
 
     def _trim_boxes(self, boxes: list[Box]) -> list[Box]:
         """Cut other bars of known size off each box.

@@ -70,8 +70,7 @@ def line_of_sight(
         return LineOfSight()
     u, v, x, y = (u0 + u1) / 2, (v0 + v1) / 2, (u1 - u0) / length, (v1 - v0) / length
     along, across = x * u + y * v, x * v - y * u
-    ends = np.array([[u0, v0], [u1, v1]])
-    lens = (1.0, 0.0) if camera.is_pinhole else _distortion_along(camera, ends)
+    lens = (1.0, 0.0) if camera.is_pinhole else _distortion_along(camera, np.array([[u0, v0], [u1, v1]]))
     sight = LineOfSight(along, across, magnification=lens[0], distortion_tilt=lens[1])
     if attitude is None:
         return sight
