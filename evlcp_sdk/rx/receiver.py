@@ -204,7 +204,7 @@ class Receiver:
 
     def _due_us(self) -> float:
         """When the next frame can be decoded, us."""
-        return min(one.framing.due_us for one in self._receivers)
+        return min([one.framing.due_us for one in self._receivers])
 
     def _process_step(self, step: TimeStep) -> list[Packet]:
         """Process a time step by each link; return the packets that are complete, of the links that fit."""
@@ -328,10 +328,12 @@ class LinkReceiver:
             self._tracker.skip_gap()
         if occupied:
             self._drop_regions(occupied, owners)
-        self._announcer.start_clock()
+        is_announced = self._announcer is not SILENT
+        if is_announced:
+            self._announcer.start_clock()
         self.framing.apply_pending(step.start_us)
         regions = self._tracker.step(step.start_us, step.events, occupied)
-        for region in regions:
+        for region in regions if is_announced else ():
             self._announcer.announce("regions", region.latest)
         self.framing.step(regions, step)
         return self._queue.step()

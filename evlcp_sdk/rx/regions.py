@@ -331,8 +331,9 @@ class TrackedRegion:
         """How far it is off its bar in place or size, px; infinite while its size is not known."""
         if self.size_px is None:
             return math.inf
-        own = *self.track.centre_at(bar.t_us), *self.size_px
-        return max(abs(a - b) for a, b in zip((*bar.centre_px, *bar.size_px), own, strict=True))
+        (x, y), (width, height) = self.track.centre_at(bar.t_us), self.size_px
+        (bar_x, bar_y), (bar_width, bar_height) = bar.centre_px, bar.size_px
+        return max(abs(bar_x - x), abs(bar_y - y), abs(bar_width - width), abs(bar_height - height))
 
     def covers_point(self, t_us: float, point_px: tuple[float, float]) -> bool:
         """Whether a point on the sensor (column, row) lies in the region at a time."""
@@ -399,7 +400,7 @@ class RegionTracker(ABC):
 
     def _limit_memory(self, most_bytes: int, step_us: int) -> None:
         """Drop the oldest events until those of all regions take `most_bytes` at the most."""
-        spare = most_bytes - sum(region.memory_bytes for region in self.alive)
+        spare = most_bytes - sum([region.memory_bytes for region in self.alive])
         while spare < 0 and (longer := [region for region in self.alive if len(region.pieces) > 1]):
             oldest_us = min(region.pieces[0][0] for region in longer)
             for region in longer:
@@ -524,31 +525,30 @@ class RhythmTracker(RegionTracker):
         self._merge_overlapping()
         self._limit_memory(self._limits.region_bytes, spec.step_us)
         self._open_regions(end_us, rises, occupied)
-        if outside >= _MIN_SWEEP_EVENTS and all(
-            one.velocity_px_us != STILL or one.size_px is None for one in self.alive
-        ):
+        resting = [one for one in self.alive if one.velocity_px_us == STILL and one.size_px is not None]
+        if outside >= _MIN_SWEEP_EVENTS and not resting:
             self._open_sweeping(start_us, events, occupied)
-        seen = list(self.alive)
+        seen, any_released = list(self.alive), False
         for region in seen:
-            region.released |= end_us - region.latest.t_us > spec.fade_us
-        self._drop_released()
+            region.released |= end_us - region.track.latest.t_us > spec.fade_us
+            any_released |= region.released
+        if any_released:
+            self._drop_released()
         return seen
 
     def _predict_boxes(self, t_us: float, occupied: Sequence[Region]) -> list[Box]:
         """The box of each region in the middle of a step; one of unknown size is kept clear of the others."""
-        centres = [self._predict_centre(region, t_us) for region in self.alive]
-        boxes = [
-            self._search_box(*centre, *self._swept_size(region))
-            for region, centre in zip(self.alive, centres, strict=True)
-        ]
-        if all(region.size_px is not None for region in self.alive):
+        boxes, others, has_unknown = [], [box_of(place) for place in occupied], False
+        for region in self.alive:
+            x_px, y_px = self._predict_centre(region, t_us)
+            boxes.append(self._search_box(x_px, y_px, *self._swept_size(region)))
+            has_unknown |= region.size_px is None
+        if not has_unknown:
             return boxes
-        others = [box_of(place) for place in occupied]
-        others += [
-            box_around(*centre, region.latest.width_px, region.latest.height_px)
-            for region, centre in zip(self.alive, centres, strict=True)
-            if region.size_px is not None
-        ]
+        for region in self.alive:
+            if region.size_px is not None:
+                last = region.track.latest
+                others.append(box_around(*self._predict_centre(region, t_us), last.width_px, last.height_px))
         return [
             subtract_boxes(box, others) if region.size_px is None else box
             for region, box in zip(self.alive, boxes, strict=True)
@@ -648,7 +648,7 @@ class RhythmTracker(RegionTracker):
             region.heights.clear()
             # Beside the bar itself there may be a halo.
             region.calm_us = 0
-            last = region.latest
+            last = region.track.latest
             until_us = last.t_us + _REMNANT_STEPS * self._spec.step_us
             region.initial_extent = -off[0], -off[1], last.width_px, last.height_px, until_us
         elif off_px < _CORRECTION_PX:
@@ -740,7 +740,7 @@ class RhythmTracker(RegionTracker):
                 # Events that were gathered for a frame were counted; those of the whole image were not.
                 region.memory_bytes -= 0 if part is events else memory_bytes(part)
             middle_us = (start_us + until_us) / 2 - self._chip_us
-            if region.latest.t_us in (until_us - self._latency_us, middle_us):
+            if region.track.latest.t_us in (until_us - self._latency_us, middle_us):
                 region.track.drop_latest()
 
     def _predict_centre(self, region: TrackedRegion, t_us: float) -> tuple[float, float]:
@@ -749,7 +749,7 @@ class RhythmTracker(RegionTracker):
             predicted = self._centre_filter.predict(region.filter, t_us)
             if predicted is not None:
                 return float(predicted[0][0]), float(predicted[0][1])
-        last, before = region.latest, region.track.previous
+        last, before = region.track.latest, region.track.previous
         if region.velocity_px_us != STILL:
             (right, down), after_us = region.velocity_px_us, t_us - last.t_us
             return last.x_px + after_us * right, last.y_px + after_us * down
@@ -794,7 +794,7 @@ class RhythmTracker(RegionTracker):
             ends_px = middle_px - excess_px / 2, middle_px + excess_px / 2
             y_px = min(ends_px, key=lambda end_px: abs(end_px - expected_px))
             if abs(y_px - expected_px) > MARGIN_PX:
-                y_px = region.latest.y_px + off_px
+                y_px = region.track.latest.y_px + off_px
         else:
             slack_px = abs(excess_px) / 2
             y_px = middle_px + min(max(expected_px - middle_px, -slack_px), slack_px)
@@ -805,7 +805,7 @@ class RhythmTracker(RegionTracker):
         self, region: TrackedRegion, box: Box, now_us: int, middle_us: float
     ) -> tuple[Any, Region, tuple[float, float]] | None:
         """Measure a region in a box: its filter's new state, place and velocity; None if it is not seen."""
-        last, before = region.latest, region.track.previous
+        last, before = region.track.latest, region.track.previous
         right, down, gap_us = last.x_px - before.x_px, last.y_px - before.y_px, last.t_us - before.t_us
         sweep = None
         if region.velocity_px_us != STILL or max(abs(right), abs(down)) > FAST_PX_US * gap_us:
@@ -828,7 +828,7 @@ class RhythmTracker(RegionTracker):
 
     def _fit_sweep(self, region: TrackedRegion, box: Box, middle_us: float) -> Sweep | None:
         """Fit a sweep to a region's newest events; None where it is slow enough for its pixels to blink."""
-        last, before = region.latest, region.track.previous
+        last, before = region.track.latest, region.track.previous
         upright, gap_us = last.height_px > last.width_px, last.t_us - before.t_us
         along_px_us = region.velocity_px_us[1 if upright else 0]
         if gap_us > 0:
@@ -887,7 +887,7 @@ class RhythmTracker(RegionTracker):
                 for place in occupied
             ]
             for region in self.alive:
-                last = region.latest
+                last = region.track.latest
                 box = self._search_box(last.x_px, last.y_px, last.width_px, last.height_px)
                 known.append(box if region.size_px else grow_box(box, merge_px))
                 if region.initial_extent is not None and end_us > region.initial_extent[4]:
@@ -997,6 +997,8 @@ class RhythmTracker(RegionTracker):
         Bars of known size do not grow: where a jolt brings one region over another, both are tracked until
         they show the same bar.
         """
+        if len(self.alive) < 2:
+            return
         boxed = [(region, box_of(region.latest)) for region in self.alive]
         for (older, box), (younger, other_box) in combinations(boxed, 2):
             if not boxes_overlap(box, other_box) or younger.released:
@@ -1026,7 +1028,7 @@ def _initial_place(region: TrackedRegion) -> Place:
     """The place that a region would have now if no frame had shown its size."""
     assert region.initial_extent is not None
     right, down, width, height, _ = region.initial_extent
-    last = region.latest
+    last = region.track.latest
     return last.x_px + right, last.y_px + down, width, height
 
 

@@ -255,10 +255,11 @@ class BlinkDetector:
             _kernels.select_boxes(
                 columns, np.array(boxes), self._pixels, limits, stride, self._columns, counts
             )
-        selected = []
+        selected, (t_us, x, y, p) = [], self._columns
         for k, count in enumerate(counts.tolist()):
             part = slice(k * stride, k * stride + count)
-            selected.append(Events.from_columns(*(column[part].copy() for column in self._columns)))
+            copied = t_us[part].copy(), x[part].copy(), y[part].copy(), p[part].copy()
+            selected.append(Events.from_columns(*copied))
         return selected
 
     def select_rhythmic(self, events: Events) -> Events:
