@@ -77,7 +77,9 @@ class Workers:
         if processes < 1:
             raise ConfigError(f"workers: {processes}, expected 1 or more")
         if processes > 1 and has_announcer:
-            raise ConfigError(f"workers: {processes}, expected 1, as a sink or plugin follows the stages")
+            raise ConfigError(
+                f"{processes} processes, expected 1 (--cores, workers), as a sink or plugin follows the stages"
+            )
         shared = {name: link for name, link in links.items() if has_bar_frames(link)}
         return cls(shared, processes - 1) if processes > 1 and shared else None
 
