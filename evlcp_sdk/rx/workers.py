@@ -78,7 +78,7 @@ class Workers:
             raise ConfigError(f"workers: {processes}, expected 1 or more")
         if processes > 1 and has_announcer:
             raise ConfigError(
-                f"{processes} processes, expected 1 (--cores, workers), as a sink or plugin follows the stages"
+                f"{processes} processes, expected 1 (--cores, workers): a sink or plugin follows the stages"
             )
         shared = {name: link for name, link in links.items() if has_bar_frames(link)}
         return cls(shared, processes - 1) if processes > 1 and shared else None

@@ -84,7 +84,7 @@ def test_what_cannot_be():
         @hookimpl
         def evlcp_stage_finished(self): ...
 
-    with pytest.raises(ConfigError, match=r"^2 processes, expected 1 \(--cores, workers\), as a sink or"):
+    with pytest.raises(ConfigError, match=r"^2 processes, expected 1 \(--cores, workers\): a sink or"):
         Receiver(LINK, Registry.load(Listens()).hook, workers=2)
     local = LINK.with_algorithm("ranging", type("Local", (Broken,), {})(), id="local")
     with pytest.raises(ConfigError, match=r"^workers: an algorithm cannot be sent to another process"):
