@@ -82,11 +82,11 @@ def test_no_kernel_reads_or_writes_beside_its_arrays(corpus, tmp_path):
     """The same files in a process whose kernels check every index."""
     code = (
         "import pathlib, random, sys; from tests.fuzz.corpus import read_recording\n"
-        "from tests.fuzz.mutate import damaged; from evlcp_sdk.errors import EvlcpError\n"
+        "from tests.fuzz.mutate import damage; from evlcp_sdk.errors import EvlcpError\n"
         "path, *good = (pathlib.Path(a) for a in sys.argv[1:])\n"
         "rng = random.Random(5)\n"
         "for n in range(60):\n"
-        "    path.write_bytes(damaged(good[n % 2].read_bytes(), rng))\n"
+        "    path.write_bytes(damage(good[n % 2].read_bytes(), rng))\n"
         "    try: read_recording(path)\n"
         "    except EvlcpError: pass\n"
     )
