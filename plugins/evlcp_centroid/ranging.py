@@ -54,7 +54,7 @@ class CentroidRanging(Ranging):
                 f" {skip}), expected at least min_clusters = {least}"
             )
         if not bar.has_distinct_centres:
-            raise ConfigError("ranging 'centroid' needs clusters layout_steps: use 'none' for this layout")
+            raise ConfigError("ranging 'centroid' needs clusters apart: use 'none' for this layout")
         layout = centres[:, 0] + 1j * centres[:, 1]
         i, j = np.triu_indices(bar.clusters, 1)
         layout_steps = layout[j] - layout[i]
