@@ -149,7 +149,7 @@ def fault_message(fault: BaseException) -> str:
 
 
 def _short_message(fault: BaseException) -> str:
-    return shorten(" ".join(str(fault).split()), 200)
+    return shorten(fault_message(fault), 200)
 
 
 def _report_line(fault: BaseException) -> str:

@@ -23,6 +23,11 @@ def round_or_none(value: float, digits: int) -> float | None:
     return round(value, digits) if math.isfinite(value) else None
 
 
+def value_or_none(value: object) -> object:
+    """A value for JSON and CSV: None for a number that was not measured, as NaN or infinity."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def format_value(value: object) -> str:
     """A value as a message shows it, shortened where it is long."""
     text = to_toml_value(value) if isinstance(value, bool | int | float | str | list) else str(value)

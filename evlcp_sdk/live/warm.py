@@ -19,7 +19,6 @@ from evlcp_sdk.scene.attitude import Attitude
 _LENGTH_US = 30_000
 """Of the recording that comes with the SDK: three packets, of which two are whole."""
 
-
 _PLACE: Final = (-2.0, 50.0, 0.5)
 """Of a bar, east, north and up of a camera that faces north, m."""
 

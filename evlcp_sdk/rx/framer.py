@@ -51,9 +51,18 @@ def to_camera_time(value: Any, camera_us: Callable[[float], float]) -> Any:
 
 
 class Announcer:
-    """Announces to a hook what each finished stage gave, on the camera's clock, and how long it took."""
+    """Announces to a hook what each finished stage gave, on the camera's clock, and how long it took.
 
-    def __init__(self, hook: Callable[..., Any] | None, camera_us: Callable[[float], float]) -> None:
+    Without a hook it announces nothing.
+
+    Attributes:
+        is_silent: There is no hook: what runs in every time step need not call it.
+    """
+
+    def __init__(
+        self, hook: Callable[..., Any] | None = None, camera_us: Callable[[float], float] = float
+    ) -> None:
+        self.is_silent = hook is None
         self._hook, self._camera_us = hook, camera_us
         self.start_clock()
 
@@ -63,8 +72,6 @@ class Announcer:
 
     def announce(self, stage: str, value: object) -> None:
         """Announce what took the time since the last announcement."""
-        if self._hook is None:
-            return
         now = time.perf_counter()
         elapsed_s, self._lap_s = now - self._lap_s, now
         self._call_hook(stage, value, elapsed_s)
@@ -85,9 +92,6 @@ class Announcer:
             raise PluginError(f"evlcp_stage_finished() of a plugin: {text}") from fault
 
 
-SILENT = Announcer(None, float)
-
-
 @dataclass(frozen=True)
 class StreamContext:
     """A stream of events, and what is known of it.
@@ -105,7 +109,7 @@ class StreamContext:
     clock: CameraClock
     attitude_at: Callable[[float], Attitude | None]
     clock_zero: ClockZero = None
-    announcer: Announcer = SILENT
+    announcer: Announcer = field(default_factory=Announcer)
     limits: Limits = LIMITS
     numbers: Iterator[int] = field(default_factory=count)
     bar_decoders: Callable[[str], Sequence[Any]] | None = None

@@ -13,7 +13,7 @@ from evlcp_sdk.clock import TimeStep
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Synchronizer
 from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame
-from evlcp_sdk.rx.framer import SILENT, Framer, StreamContext, record_light
+from evlcp_sdk.rx.framer import Framer, StreamContext, record_light
 from evlcp_sdk.rx.guard import Guard, compile_algorithm
 from evlcp_sdk.rx.reading import BarDecoder, FrameDecoder, FrameJob, FrameResult, LocalBarDecoder
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
@@ -295,7 +295,7 @@ class PacketFramer(Framer):
         for start_us, events in pieces:
             self.counts["events_in_regions"] += events.t_us.size
             until_us = min(start_us + self._step_us, step.end_us)
-            if self._announcer is not SILENT:
+            if not self._announcer.is_silent:
                 self._announcer.start_clock()
             try:
                 transmitter.sync, locks = self._synchronizer.step(

@@ -13,7 +13,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Tracker
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame, FrameAligner, Pilot
-from evlcp_sdk.rx.framer import SILENT, Announcer
+from evlcp_sdk.rx.framer import Announcer
 from evlcp_sdk.rx.guard import Guard, compile_algorithm, compile_tracker
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import compile_finder
@@ -314,8 +314,8 @@ class FrameDecoder:
         algorithms: Those of the link.
     """
 
-    def __init__(self, link: Link, announcer: Announcer = SILENT) -> None:
-        self.algorithms = FrameAlgorithms(link, announcer, compile_tracker(link))
+    def __init__(self, link: Link, announcer: Announcer | None = None) -> None:
+        self.algorithms = FrameAlgorithms(link, announcer or Announcer(), compile_tracker(link))
         self.aligner = FrameAligner(
             link.packet,
             link.regions,

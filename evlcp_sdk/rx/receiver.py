@@ -13,7 +13,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import name_links
 from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx.detector import DetectorTracker
-from evlcp_sdk.rx.framer import SILENT, Announcer, Framer, StreamContext, to_camera_time
+from evlcp_sdk.rx.framer import Announcer, Framer, StreamContext, to_camera_time
 from evlcp_sdk.rx.framing import PacketFramer
 from evlcp_sdk.rx.guard import compile_tracker
 from evlcp_sdk.rx.inbox import MessageAssembler
@@ -94,10 +94,10 @@ class Receiver:
         self._timeline = Timeline(first.regions.step_us, camera.width, camera.height, limits.step_events)
         self._clock = clock = self._timeline.clock
         limits = replace(limits, region_bytes=limits.region_bytes // len(links))
-        announcer = SILENT
+        announcer = Announcer()
         if hook is not None and hook.evlcp_stage_finished.get_hookimpls():
             announcer = Announcer(hook.evlcp_stage_finished, clock.camera_us)
-        self._workers = Workers.start(links, workers, has_announcer=announcer is not SILENT)
+        self._workers = Workers.start(links, workers, has_announcer=not announcer.is_silent)
         bar_decoders = None if self._workers is None else self._workers.bar_decoders
         stream = StreamContext(
             clock, attitude_source(attitude), clock_zero, announcer, limits, bar_decoders=bar_decoders
@@ -328,12 +328,11 @@ class LinkReceiver:
             self._tracker.skip_gap()
         if occupied:
             self._drop_regions(occupied, owners)
-        is_announced = self._announcer is not SILENT
-        if is_announced:
+        if not self._announcer.is_silent:
             self._announcer.start_clock()
         self.framing.apply_pending(step.start_us)
         regions = self._tracker.step(step.start_us, step.events, occupied)
-        for region in regions if is_announced else ():
+        for region in () if self._announcer.is_silent else regions:
             self._announcer.announce("regions", region.latest)
         self.framing.step(regions, step)
         return self._queue.step()

@@ -13,11 +13,12 @@ import numpy as np
 from markupsafe import Markup
 
 from evlcp_sdk.files import escape_formula
+from evlcp_sdk.formatting import value_or_none
 from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.stopwatch import times_real_time
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, Figure, format_number, measure_figure
 from evlcp_sdk.study.summary import Series, Summary
-from evlcp_sdk.study.tally import Statistics, Tally, value_or_none
+from evlcp_sdk.study.tally import Statistics, Tally
 
 STAGES = ("separation", "decoding", "ranging")
 """The stages of every frame whose time is measured."""

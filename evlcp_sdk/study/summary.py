@@ -11,12 +11,13 @@ from itertools import zip_longest
 from typing import Any, Literal
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.formatting import value_or_none
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.study.collect import PointProgress
 from evlcp_sdk.study.intervals import Figure, measure_figure
 from evlcp_sdk.study.plan import Plan
 from evlcp_sdk.study.store import Store
-from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally, value_or_none
+from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
 
 
 @dataclass(frozen=True)

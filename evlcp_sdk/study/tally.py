@@ -48,11 +48,6 @@ def segment_of(distance_m: float) -> int:
     return math.floor(distance_m / SEGMENT_M) * SEGMENT_M
 
 
-def value_or_none(value: Any) -> Any:
-    """A value for JSON and CSV: None for a number that was not measured."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def to_nm(length_m: float) -> int:
     """Convert a length to a whole number of nanometres, so that sums are exact.
 

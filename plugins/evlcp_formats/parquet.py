@@ -1,10 +1,10 @@
 """`frames.parquet`: the rows of `frames.csv` with their types."""
 
 import json
-import math
 from collections.abc import Mapping
 from typing import Any
 
+from evlcp_sdk.formatting import value_or_none
 from evlcp_sdk.results.columns import LINK_COLUMN, frame_columns, frame_value
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
@@ -34,7 +34,7 @@ class FramesParquet(Sink):
     def packet(self, packet: Packet) -> None:
         """Keep the frames, and write a group when there are enough."""
         for frame in packet.frames:
-            self._waiting.append({name: _to_json(frame_value(frame, name)) for name in self._columns})
+            self._waiting.append({name: value_or_none(frame_value(frame, name)) for name in self._columns})
             if len(self._waiting) == self.GROUP:
                 self._flush()
 
@@ -53,7 +53,3 @@ class FramesParquet(Sink):
             self._flush()
         self._writer.close()
         return {}
-
-
-def _to_json(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
