@@ -11,7 +11,7 @@ from evlcp_sdk.plugin.roles import Corrected
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.exercises import compile_subject, link_of, require_column
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, expect, law
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events
+from evlcp_sdk.testing.recordings import bar_in_sight, ideal_events
 
 _LENGTHS = (1, 31, 64, 100, 256, 333, 640, 1025, 1280)
 """Lengths of blocks on air: of the built-in profiles, powers of two, and others."""
@@ -172,7 +172,7 @@ def _check_clean_link(subject: Subject) -> None:
         [symbols_of_bits(code.encode(bits), book.bits_per_symbol, book.clusters) for bits in sent]
     )
     receiver = Receiver(link)
-    packets = receiver.feed(ideal_events(link, IdealBar(symbols))) + receiver.close()
+    packets = receiver.feed(ideal_events(link, bar_in_sight(link, symbols))) + receiver.close()
     expect(len(packets) == len(sent), f"{len(sent)} packets of a clean recording, got {len(packets)}")
     for i, (packet, bits) in enumerate(zip(packets, sent, strict=True)):
         llr = np.concatenate([frame.soft.llr.ravel() for frame in packet.frames])

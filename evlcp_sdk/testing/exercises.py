@@ -14,7 +14,7 @@ from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES, STEPS
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compile_or_skip
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
+from evlcp_sdk.testing.recordings import IdealBar, bar_in_sight, ideal_events, random_symbols
 from evlcp_sdk.testing.views import ideal_frame, ideal_sums, ideal_view
 from evlcp_sdk.values import Events
 
@@ -127,7 +127,7 @@ def symbols_of(codebook: Codebook, seed: int = 0) -> np.ndarray[Any, np.dtype[np
 
 def make_recording(link: Link, packets: int, **how: Any) -> tuple[IdealBar, Events]:
     """Return a bar that sends random symbols, and its events; `how` has arguments of `ideal_events`."""
-    bar = IdealBar(random_symbols(link, packets))
+    bar = bar_in_sight(link, random_symbols(link, packets))
     return bar, ideal_events(link, bar, **how)
 
 

@@ -6,7 +6,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.exercises import link_of, require_column
 from evlcp_sdk.testing.law import Subject, compile_or_skip, expect, law
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
+from evlcp_sdk.testing.recordings import bar_in_sight, ideal_events, random_symbols
 
 _PACKETS = 3
 _CLUSTER_PX = 8.0
@@ -29,7 +29,7 @@ def _check_sparse(subject: Subject) -> None:
 
 def _expect_clean(link: Link) -> None:
     require_column(link)
-    bar = IdealBar(random_symbols(link, _PACKETS), cluster_px=_CLUSTER_PX)
+    bar = bar_in_sight(link, random_symbols(link, _PACKETS), cluster_px=_CLUSTER_PX)
     receiver = compile_or_skip(lambda: Receiver(link))
     packets = receiver.feed(ideal_events(link, bar, missing=0.0)) + receiver.close()
     frames = [frame for packet in packets for frame in packet.frames]

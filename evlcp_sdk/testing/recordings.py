@@ -1,6 +1,7 @@
 """Ideal recordings: a bar whose every pixel sends a few events after each edge."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +49,12 @@ def random_symbols(link: Link, packets: int, seed: int = 0) -> NDArray[np.int64]
     return np.random.default_rng(seed).integers(0, link.codebook.data_symbols, shape)
 
 
+def bar_in_sight(link: Link, symbols: NDArray[np.int64], **how: Any) -> IdealBar:
+    """Return a bar that is away from the edges of the link's sensor; `how` has more of its attributes."""
+    x_px, y_px = min(IdealBar.x_px, link.camera.width / 2), min(IdealBar.y_px, link.camera.height / 2)
+    return replace(IdealBar(symbols, x_px, y_px), **how)
+
+
 def ideal_events(
     link: Link,
     bar: IdealBar,
@@ -60,6 +67,8 @@ def ideal_events(
     t0_us: int = 0,
 ) -> Events:
     """Return the events of an ideal sensor: some per pixel and edge, delayed, jittered, some missing.
+
+    Three of an edge are spread over a quarter of a chip, however long that is.
 
     Args:
         link: The link, with codebook, packet format and the size of the sensor.
@@ -88,10 +97,10 @@ def ideal_events(
     order = np.tile(np.arange(count) // bar.width_px, len(when) // count)
     # The end of the last packet is drawn last, so that the packets do not depend on what follows them.
     many = int(np.count_nonzero(when < len(chips)))
-    draws = [(rng.normal(0, 4, n), rng.random(n)) for n in (many, len(when) - many)]
+    draws = [(rng.normal(0, 0.04 * link.packet.chip_us, n), rng.random(n)) for n in (many, len(when) - many)]
     jitter_us, chance = (np.concatenate(one) for one in zip(*draws, strict=True))
     t = bar.start_us + when * chip_us
-    t = t + np.where(sign > 0, delay_on_us, delay_off_us) + 12 * order + jitter_us
+    t = t + np.where(sign > 0, delay_on_us, delay_off_us) + 0.12 * link.packet.chip_us * order + jitter_us
     x, y = bar.centre(t)
     u = np.floor(x - bar.width_px / 2 + 0.5 + column)
     v = np.floor(y - rows / 2 + 0.5 + row)
@@ -100,9 +109,9 @@ def ideal_events(
     t_us = np.floor(t[keep]).astype(np.int64) + t0_us
     first = np.argsort(t_us, kind="stable")
     seen = Events.of(t_us[first], u[keep][first], v[keep][first], (sign[keep] > 0)[first])
-    # The recording goes on for a while: its last event is noise in a corner.
-    end_us = bar.start_us + len(chips) * chip_us + t0_us
-    return Events.concat([seen, Events.of([end_us + 1000], [0], [0], [1])])
+    # The recording goes on for ten chips: its last event is noise in a corner.
+    end_us = bar.start_us + (len(chips) + 10) * chip_us + t0_us
+    return Events.concat([seen, Events.of([end_us], [0], [0], [1])])
 
 
 def merge_events(*parts: Events) -> Events:

@@ -1,7 +1,10 @@
 """Every algorithm of the SDK keeps every law of its role."""
 
+from pathlib import Path
+
 import pytest
 
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.testing import laws_of
 from evlcp_sdk.testing.law import Subject, apply_law
@@ -30,3 +33,15 @@ def test_law(role, id, law):
         assert (role, id) in DO_NOTHING
         pytest.skip(outcome.detail)
     assert outcome.status == "ok", outcome.detail
+
+
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parents[2] / "examples" / "links").glob("*.toml")), ids=lambda p: p.stem
+)
+def test_the_time_of_other_sensors_is_found(path):
+    link = load_link(path)
+    subject = Subject("synchronization", link.algorithm("synchronization"), link)
+    for law in laws_of("synchronization"):
+        if law.name in ("finds-time", "clean-link"):
+            outcome = apply_law(law, subject, {})
+            assert outcome.status == "ok", outcome.detail
