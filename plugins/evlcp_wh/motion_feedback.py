@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from itertools import groupby
-from math import inf
 from typing import Annotated
 
 import numpy as np
@@ -28,25 +27,21 @@ _STEP_PX = 0.3
 _PLACE_PX = 1.0
 """Prior sigma of the bar's distance from its place."""
 
-_ROUNDS = 2
-"""Rounds of motion and symbols: the symbols of the first round give the motion of the second."""
-
 
 @dataclass(frozen=True)
 class MotionFeedback(Decoding):
-    """Decision feedback of motion: find from the chips where the bar was, remove the motion, decode, again.
+    """Find from the chips where the bar was, remove the motion, and decode again.
 
     The clusters' pixel maps and the values that they send make the image that each value should give; its
     match with the events, pixel by pixel in log-likelihood ratios as `ml-soft` learns them, shows how likely
-    the bar was so many pixels off its place then. In the first round the pilot's values are known, and each
-    info value of a cluster is the one that fits better; in the second all are known from the decision. The
-    likeliest smooth path over all values (Viterbi) is removed from the sums, the clusters are separated again
-    by their pilots, and their info segments decoded. A frame whose path stays at 0 is decoded as by
-    `ml-soft`; one whose path comes within a pixel of the border of what is searched, or leaves a bit unsure,
-    is sought farther.
+    the bar was so many pixels off its place then. The pilot's values are known, and each info value of a
+    cluster is the one that fits better. The likeliest smooth path over all values (Viterbi) is removed from
+    the sums, the clusters are separated again by their pilots, and their info segments decoded. A frame whose
+    path stays at 0 is decoded as by `ml-soft`; one whose path comes within a pixel of the border of what is
+    searched, or leaves a bit unsure, is sought farther.
 
-    A path that started from decisions alone would confirm a wrong one: a bar off by the spacing of its
-    clusters decodes to its neighbours' symbols without a fault.
+    A path from decisions would confirm a wrong one: a bar off by the spacing of its clusters decodes to its
+    neighbours' symbols without a fault.
     """
 
     reach_px: Annotated[
@@ -60,7 +55,7 @@ class MotionFeedback(Decoding):
         """Precompute for a codebook's pilots and codewords."""
         codebook.require_pairs("decoding", "motion-feedback", "edges")
         decoder, posterior = MlDecoder(codebook), CellPosterior(codebook.pilot_edges.astype(np.int64))
-        pilots, words = to_kernel_array(codebook.pilot_edges), codebook.codeword_edges
+        pilots = to_kernel_array(codebook.pilot_edges)
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             presence, sums = presence.apply_prior(), to_kernel_array(sums)
@@ -83,19 +78,16 @@ class MotionFeedback(Decoding):
             the same clusters a spacing back: what it passed on the way contradicts the symbols, and leaves a
             bit unsure. What was decoded until then does not count.
             """
-            known, least, reach_px = pilots, inf, matches.shape[1] // 2
-            done = [[0, 0]] * matches.shape[3]
-            for _ in range(_ROUNDS):
-                path = find_path(matches, known).tolist()
-                if reach_px < self.far_px and max(abs(px) for at in path for px in at) >= reach_px - 1:
-                    return soft, True
-                if path == done:
-                    break
-                still, done = remove_motion(sums, path), path
-                probability = posterior.probability(still, presence.grid_px)
-                presence = replace_fields(presence, probability=probability).apply_prior()
-                soft, least, *_ = decoder.decode(presence, still)
-                known = np.concatenate([pilots, words[soft.symbols]], axis=1)
+            path, reach_px = find_path(matches, pilots).tolist(), matches.shape[1] // 2
+            farthest_px = max(abs(px) for at in path for px in at)
+            if reach_px < self.far_px and farthest_px >= reach_px - 1:
+                return soft, True
+            if farthest_px == 0:
+                return soft, False
+            still = remove_motion(sums, path)
+            probability = posterior.probability(still, presence.grid_px)
+            presence = replace_fields(presence, probability=probability).apply_prior()
+            soft, least, *_ = decoder.decode(presence, still)
             return soft, least < _UNSURE_LLR
 
         return decode
