@@ -182,6 +182,7 @@ class PacketFramer(Framer):
         # Number, place and misses.
         self._ended: deque[tuple[int | None, tuple[float, float], Counter[str]]] = deque(maxlen=_MAX_ENDED)
         self._due: deque[TrackedRegion] = deque()
+        self._images: set[int] = set()
         # Frames that end in one step, and how long it takes to decode those before a first lock.
         per_step = self._step_us / (link.packet.info_chips * link.packet.chip_us)
         self._max_due = math.ceil(per_step) + _MAX_OVERDUE
@@ -198,6 +199,7 @@ class PacketFramer(Framer):
         """Apply the decoded frames that are due to be applied at the start of a time step."""
         self._now_us = start_us
         self._dropped.clear()
+        self._images.clear()
         while self._pending and self._pending[0].step_us + _APPLY_AFTER_STEPS * self._step_us <= start_us:
             self._apply_frame(self._pending.popleft())
 
@@ -537,12 +539,17 @@ class PacketFramer(Framer):
         self._queue_frame(transmitter, due, self._build_detection(transmitter, due, found, frame))
 
     def _open_other_images(self, region: TrackedRegion, shown: BarPlace) -> None:
+        """Open regions where a frame shows its bar again; those show others in the next step only.
+
+        Images that touch are placed anew in each frame, and would go on opening one another.
+        """
         assert self._follower is not None
-        for centre_px, size_px in shown.others:
+        for centre_px, size_px in () if region.id in self._images else shown.others:
             known = any(one.covers_point(shown.t_us, centre_px) for one in self._regions.alive)
             if not known and self._follower.has_room():
-                image = BarPlace(shown.t_us, centre_px, size_px)
-                self._due.append(self._follower.open_duplicate(region, image))
+                image = self._follower.open_duplicate(region, BarPlace(shown.t_us, centre_px, size_px))
+                self._images.add(image.id)
+                self._due.append(image)
 
     def _retime_frame(self, transmitter: Transmitter, due: DueFrame) -> DueFrame:
         """Time a frame that is due anew where the light has changed since the preamble."""

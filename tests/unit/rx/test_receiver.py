@@ -13,6 +13,7 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.framing import SkippedFrame
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.rx.regions import BarPlace
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merge_events, random_symbols
 from evlcp_sdk.values import Events, PresenceMap, replace_fields
@@ -184,6 +185,20 @@ def test_two_bars_a_few_pixels_apart_are_two(apart_px):
         mine = [p for p in packets if abs(p.frames[0].x_px - bar.x_px + 0.5) < 1]
         assert len({p.transmitter for p in mine}) == 1
         assert len(frames_of(mine)) >= 28
+
+
+def test_an_image_of_a_bar_opens_no_further_ones_in_its_step():
+    receiver = Receiver(LINK)
+    receiver.feed(lit(2)[1][:40_000])
+    framer = receiver._receivers[0].framing
+    (region,), latest = framer._regions.alive, framer._regions.alive[0].latest
+    others = [((latest.x_px + 100 * n, latest.y_px), (4.0, 128.0)) for n in (1, 2)]
+    framer._open_other_images(region, BarPlace(latest.t_us, *others[0], others=(others[0],)))
+    shown = BarPlace(latest.t_us, *others[1], others=(others[1],))
+    for count in (2, 3):
+        framer._open_other_images(framer._regions.alive[1], shown)
+        assert len(framer._regions.alive) == count
+        framer.apply_pending(round(latest.t_us) + 1500)
 
 
 def test_a_dark_cluster_costs_only_itself():
