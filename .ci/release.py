@@ -78,7 +78,8 @@ def built(out: Path) -> tuple[Path, Path]:
         run(*build, target, "-d", out, cwd=ROOT)
     (sdist,), (wheel,) = out.glob("*.tar.gz"), out.glob("*.whl")
     with tempfile.TemporaryDirectory() as folder:
-        shutil.unpack_archive(sdist, folder, filter="data")
+        # Python's own, without a filter, is deprecated from 3.12 on, and has none before 3.11.4.
+        run("tar", "-xf", sdist, "-C", folder, cwd=ROOT)
         (unpacked,) = Path(folder).iterdir()
         run(*build, "wheel", "-d", Path(folder) / "again", cwd=unpacked)
         (again,) = (Path(folder) / "again").glob("*.whl")
