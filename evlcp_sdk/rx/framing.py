@@ -543,8 +543,10 @@ class PacketFramer(Framer):
 
         Images that touch are placed anew in each frame, and would go on opening one another.
         """
+        if region.id in self._images:
+            return
         assert self._follower is not None
-        for centre_px, size_px in () if region.id in self._images else shown.others:
+        for centre_px, size_px in shown.others:
             known = any(one.covers_point(shown.t_us, centre_px) for one in self._regions.alive)
             if not known and self._follower.has_room():
                 image = self._follower.open_duplicate(region, BarPlace(shown.t_us, centre_px, size_px))

@@ -35,9 +35,10 @@ def subject_of(role: str, algorithm: Any, link: Link | None = None) -> Subject:
 
 
 @cache
-def single_cluster_link() -> Link:
-    """Return the default link with a bar of one cluster."""
-    return resolve({"bar": ONE_CLUSTER})
+def single_cluster_link(link: Link | None = None) -> Link:
+    """Return the default link with a bar of one cluster, on the sensor and at the rate of another link."""
+    table = {} if link is None else {name: link.table[name] for name in ("camera", "air")}
+    return resolve({**table, "bar": ONE_CLUSTER})
 
 
 @cache

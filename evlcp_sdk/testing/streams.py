@@ -161,7 +161,7 @@ def _check_region_shapes(subject: Subject) -> None:
     found = feed_events(detector, events, _step_times(events))
     if link.bar.clusters > 1 and not any(found):
         # A detector of single lights finds none in a bar.
-        _check_region_shapes.test(replace(subject, link=single_cluster_link()))
+        _check_region_shapes.test(replace(subject, link=single_cluster_link(link)))
         return
     for regions in found:
         ids = [region.id for region in regions]
