@@ -1577,7 +1577,7 @@ def estimate_curvature(
 @njit
 def add_phase_bias(
     place: Array, sums: Array, least: float, out: Array, known: tuple[Array, Array], off: Array
-) -> tuple[float, float, float, float, float]:
+) -> tuple[float, float, float, float, float, float]:
     """Add a frame's evidence of a pixel-phase bias, beyond any parabola, to `out` (4,).
 
     That is, of the residuals about the best parabola, weighted: the sum of squares of the bias' pattern, of
@@ -1589,7 +1589,8 @@ def add_phase_bias(
 
     Returns:
         Sums of squares of the offsets, of their means and of the mean patterns over all frames; the median
-        change of the offsets since the frame before, NaN of none; and how many frames weigh as much as all.
+        change of the offsets since the frame before, NaN of none; how many frames weigh as much as all; and
+        how many of them show the same errors, as they have the same pattern.
     """
     right, inverse = np.empty((2, 3)), np.empty((3, 3))
     weight, moved = sums[0], np.empty(place.size)
@@ -1597,6 +1598,7 @@ def add_phase_bias(
     many: Any = np.int64(0)
     n, lightest = _solve_parabola(place, weight, sums[1:], least, right, inverse)
     squares, mean_squares, pattern_squares, light, all_light = 0.0, 0.0, 0.0, 0.0, 0.0
+    own_squares = 1e-300
     for i in range(place.size):
         off[i] = np.nan
         if weight[i] > lightest:
@@ -1604,6 +1606,7 @@ def add_phase_bias(
             squares += off[i] * off[i]
             mean_squares += (known[0][1, i] / known[0][0, i]) ** 2
             pattern_squares += (known[0][2, i] / known[0][0, i]) ** 2
+            own_squares += (sums[2, i] / weight[i]) ** 2
             light += weight[i]
             all_light += known[0][0, i]
             if known[1].size == place.size and known[1][i] == known[1][i]:
@@ -1621,7 +1624,8 @@ def add_phase_bias(
                 out[2] -= right[0, a] * inverse[a, b] * right[0, b]
         out[3] += n - 3
     frames = all_light / max(light, 1e-300)
-    return squares, mean_squares, pattern_squares, median(moved, many) if many else np.nan, frames
+    alike = frames * min(pattern_squares / own_squares, 1.0)
+    return squares, mean_squares, pattern_squares, median(moved, many) if many else np.nan, frames, alike
 
 
 @njit

@@ -1,6 +1,7 @@
 """Distorted images of bars: boundaries between clusters that no straight bar explains."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -107,7 +108,7 @@ def assess_distortion(
     curvature: Curvature,
     offset: Floats,
     sums: Floats,
-    scatter: tuple[float, ...],
+    scatter: Sequence[float],
     before: Distortion,
     t_s: float,
 ) -> Distortion:

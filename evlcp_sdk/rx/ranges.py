@@ -130,11 +130,11 @@ class RangeCorrector:
             sums, sums_s = new_sums + faded * sums if goes_on else new_sums, t_s
             tilt_known = line_of_sight.tilt_sine is not None
             bias_sums, offset = bias_sums * faded, np.empty(new_sums.shape[1])
-            scatter = _kernels.add_phase_bias(
+            *scatter, alike = _kernels.add_phase_bias(
                 curvature.place, new_sums, _MIN_WEIGHT, bias_sums, (sums, state.offset), offset
             )
             evidence = bias_sums.tolist()
-            bias = _estimate_bias(evidence)
+            bias = _estimate_bias(evidence, max(alike, CORRELATED_FRAMES))
             distance_m -= _BIAS_SHARE * bias[0] * curvature.phase_bias_m
             # The ranging's sigma is that of boundaries with the bias.
             sigma_m *= math.sqrt(_remaining_scatter(evidence, bias[0]))
@@ -204,12 +204,15 @@ def _weigh_boundaries(curvature: Curvature, tilt_sine: float) -> Floats:
     return sums
 
 
-def _estimate_bias(bias_sums: list[float]) -> tuple[float, float]:
-    """Amplitude of the pixel-phase bias, px, and its variance, by the evidence of frames and its prior."""
+def _estimate_bias(bias_sums: list[float], correlated_frames: float) -> tuple[float, float]:
+    """Amplitude of the pixel-phase bias, px, and its variance, by the evidence of frames and its prior.
+
+    So many frames have the same errors: of a camera that stands still, all.
+    """
     squares, products, residuals, freedom = bias_sums
     if not (squares > 0 and freedom > 1):
         return 0.0, PHASE_BIAS_PX**2
-    noise = CORRELATED_FRAMES * max(residuals - products**2 / squares, 1e-12 * squares) / (freedom - 1)
+    noise = correlated_frames * max(residuals - products**2 / squares, 1e-12 * squares) / (freedom - 1)
     variance = 1 / (squares / noise + PHASE_BIAS_PX**-2)
     return products / noise * variance, variance
 
