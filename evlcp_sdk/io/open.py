@@ -226,11 +226,6 @@ def open_writer(
             f"{path}: {found}, expected {', '.join(WRITABLE)} or format EVT2, EVT3, NPZ, CSV, or one that a"
             " plugin writes, as .mcap"
         )
-    if width is None or height is None:
-        raise ConfigError(
-            f"{path}: the size of the sensor is not known, expected a width and a height for {name}, as"
-            " `--size 1280x720` gives them"
-        )
     return RawWriter(path, width, height, CODECS[name], outputs)
 
 

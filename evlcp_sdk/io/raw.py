@@ -385,7 +385,7 @@ class RawWriter(EventWriter):
 
     Raises:
         OutputError: The file cannot be written.
-        ConfigError: The sensor is larger than the words can address.
+        ConfigError: The size of the sensor is unknown, or larger than the words can address.
     """
 
     # Words do not state how often the clock has rolled over. Before a first time beyond its range (EVT3: 16.8
@@ -393,14 +393,27 @@ class RawWriter(EventWriter):
     times_us = (0, (1 << 40) - 1)
 
     def __init__(
-        self, path: Path | str, width: int, height: int, codec: Codec = EVT3, outputs: Outputs | None = None
+        self,
+        path: Path | str,
+        width: int | None,
+        height: int | None,
+        codec: Codec = EVT3,
+        outputs: Outputs | None = None,
     ) -> None:
+        if width is None or height is None:
+            raise ConfigError(
+                f"{path}: the size of the sensor is not known, expected a width and a height for"
+                f" {codec.name}, as `--size 1280x720` gives them"
+            )
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
             raise ConfigError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
-        super().__init__(path, width, height, outputs)
         self.channels = codec.channels
         self._encoder = RawEncoder(codec)
-        self._file.write(format_header(codec, width, height))
+        self._header = format_header(codec, width, height)
+        super().__init__(path, width, height, outputs)
+
+    def _begin(self) -> None:
+        self._file.write(self._header)
 
     def _write(self, events: Events, triggers: Triggers) -> None:
         for words in self._encoder.encode(events, triggers):

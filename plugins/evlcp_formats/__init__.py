@@ -5,7 +5,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import InputError
 from evlcp_sdk.files import path_exists
 from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
 
@@ -84,11 +84,9 @@ def evlcp_open_writer(
     """Write a bag of ROS 2: format BAG, or `.mcap`."""
     if (format or path.suffix).upper() not in ("BAG", ".MCAP"):
         return None
-    if width is None or height is None:
-        raise ConfigError(f"{path}: sensor of {width}x{height}, expected a width and a height for BAG")
     from evlcp_formats.ros import EventBagWriter
 
-    return EventBagWriter(path, width, height, outputs)
+    return EventBagWriter(path, width, height, outputs=outputs)
 
 
 @hookimpl

@@ -6,14 +6,14 @@ import sqlite3
 import struct
 import zlib
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
-from evlcp_sdk.errors import EvlcpError, InputError
+from evlcp_sdk.errors import InputError
 from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import ChunkReader, RawSource, format_header
 from evlcp_sdk.io.urls import split_options
@@ -28,8 +28,6 @@ _STEPS: Final = 1_000_000
 _STEPS_A_BYTE: Final = 4
 _STEPS_AT_ONCE: Final = 10_000
 """Steps that SQLite may take, in all, per byte and between checks; a row of a message takes twenty."""
-
-_MAGICS: Final = {b"#ROSBAG V2.0": "ROS 1", b"SQLite format 3": "SQLite", b"\x89MCAP0\r\n": "MCAP"}
 
 
 @dataclass(frozen=True)
@@ -59,14 +57,7 @@ def open_bag(url: str) -> "BagSource":
             needed.
     """
     named, options = split_options(url, {"topic": str}) if url.startswith("bag:") else (url, {})
-    path = named.removeprefix("bag:")
-    try:
-        return BagSource(path, options.get("topic"))
-    except EvlcpError:
-        raise
-    except Exception as fault:
-        # A damaged bag makes a reader fail in any way.
-        raise InputError(f"{path}: a damaged bag: {type(fault).__name__}: {fault}") from fault
+    return BagSource(named.removeprefix("bag:"), options.get("topic"))
 
 
 class BagSource(RawSource):
@@ -219,22 +210,30 @@ def _list_files(path: Path) -> list[Path]:
 
 
 def _read_bag(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    if not path.exists():
-        raise InputError(f"{path}: No such file or directory")
-    files = _list_files(path)
-    if not files:
-        raise InputError(f"{path}: a folder without .db3 or .mcap files, expected a bag")
-    parts = []
-    for file in files:
-        with file.open("rb") as opened:
-            start = opened.read(16)
-        kind = next((kind for magic, kind in _MAGICS.items() if start.startswith(magic)), None)
-        if kind is None:
-            raise InputError(
-                f"{file}: starts with {start[:8].hex(' ')}, expected a bag of ROS 1, SQLite or MCAP"
-            )
-        parts.append(_read_file(file, kind, topic, stack))
-    return (packet for part in parts for packet in part)
+    at = path
+    try:
+        if not path.exists():
+            raise InputError(f"{path}: No such file or directory")
+        files = _list_files(path)
+        if not files:
+            raise InputError(f"{path}: a folder without .db3 or .mcap files, expected a bag")
+        readers = [(file, _choose_reader(file)) for file in files]
+        for at, reader in readers:
+            yield from reader(at, topic, stack)
+    except InputError:
+        raise
+    except Exception as fault:
+        # A damaged bag makes a reader fail in any way.
+        raise InputError(f"{at}: {type(fault).__name__}: {fault}") from fault
+
+
+def _choose_reader(path: Path) -> Callable[[Path, str | None, ExitStack], Iterator[EventPacket]]:
+    with path.open("rb") as file:
+        start = file.read(16)
+    for magic, reader in _READERS.items():
+        if start.startswith(magic):
+            return reader
+    raise InputError(f"{path}: starts with {start[:8].hex(' ')}, expected a bag of ROS 1, SQLite or MCAP")
 
 
 def _choose_topic(path: Path, topics: dict[str, str], topic: str | None) -> str:
@@ -249,16 +248,6 @@ def _choose_topic(path: Path, topics: dict[str, str], topic: str | None) -> str:
         hint = "" if not fitting else "; choose one by ?topic=NAME"
         raise InputError(f"{path}: {what} of type event_camera_msgs/EventPacket (topics: {names}){hint}")
     return fitting[0]
-
-
-def _read_file(path: Path, kind: str, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    try:
-        yield from {"ROS 1": _read_ros1, "SQLite": _read_sqlite, "MCAP": _read_mcap}[kind](path, topic, stack)
-    except InputError:
-        raise
-    except Exception as fault:
-        # A damaged bag makes a reader fail in any way.
-        raise InputError(f"{path}: {type(fault).__name__}: {fault}") from fault
 
 
 def _read_sqlite(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
@@ -315,6 +304,13 @@ def _read_ros1(path: Path, topic: str | None, stack: ExitStack) -> Iterator[Even
     chosen = _choose_topic(path, {one.topic: one.msgtype for one in reader.connections}, topic)
     for _, _, data in reader.messages([one for one in reader.connections if one.topic == chosen]):
         yield _parse_ros1(path, data)
+
+
+_READERS: Final = {
+    b"#ROSBAG V2.0": _read_ros1,
+    b"SQLite format 3": _read_sqlite,
+    b"\x89MCAP0\r\n": _read_mcap,
+}
 
 
 def _import_extra(path: Path, module: str) -> Any:

@@ -1,15 +1,11 @@
 """Write bags of ROS 2 without ROS: one MCAP file, its messages packed by `rosbags`."""
 
-from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
 
 from evlcp_sdk.errors import ConfigError, import_extra
-from evlcp_sdk.files import Outputs
-from evlcp_sdk.io.evt import EVT3, MAX_SIDE
-from evlcp_sdk.io.raw import RawEncoder, RawWriter
-from evlcp_sdk.plugin.writer import EventWriter
+from evlcp_sdk.io.raw import RawWriter
 from evlcp_sdk.values import Events, Triggers
 
 EVENT_PACKET: Final = "event_camera_msgs/msg/EventPacket"
@@ -66,26 +62,18 @@ class RosBag:
         self._writer.finish()
 
 
-class EventBagWriter(EventWriter):
-    """Writes a bag of `event_camera_msgs/EventPacket` with EVT3 words, a message every 10 ms.
+class EventBagWriter(RawWriter):
+    """Writes the words of a RAW file as a bag of `event_camera_msgs/EventPacket`, a message every 10 ms.
 
     Messages are stamped by the camera's clock. The bag reads back as it was written.
 
     Raises:
-        ConfigError: `mcap` or `rosbags` is not installed, or the sensor is larger than the words can address.
+        ConfigError: `mcap` or `rosbags` is not installed, or the size of the sensor is unknown or too large.
         OutputError: The file cannot be written.
     """
 
-    times_us = RawWriter.times_us
-    channels = EVT3.channels
     topic = "/event_camera/events"
-
-    def __init__(self, path: Path | str, width: int, height: int, outputs: Outputs | None = None) -> None:
-        if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-            raise ConfigError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
-        super().__init__(path, width, height, outputs)
-        self._encoder = RawEncoder(EVT3)
-        self._seq = 0
+    _seq = 0
 
     def _begin(self) -> None:
         try:
