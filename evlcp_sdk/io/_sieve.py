@@ -25,23 +25,20 @@ class Sieve:
 
     Args:
         unit: The unit of positions in `losses`: `line` or `row`.
+        first: The line or row of the first event, as a heading is none.
         width: Columns of the sensor, or None if unknown.
         height: Rows of the sensor, or None.
     """
 
-    def __init__(self, unit: str, width: int | None, height: int | None) -> None:
-        self._unit = unit
+    def __init__(self, unit: str, first: int, width: int | None, height: int | None) -> None:
+        self._unit, self._first = unit, first
         self._clock = CameraClock(width or 1 << 16, height or 1 << 16, is_sparse=True)
-        self._firsts: dict[str, int] = {}
-        self._row_offset = 0
 
-    def sift(self, events: Events, first: int) -> Events:
+    def sift(self, events: Events) -> Events:
         """Return those of the next events to keep, and earlier ones whose times are now confirmed.
 
-        `first` is the line or row of the first of them; the columns stay the caller's.
+        The columns stay the caller's.
         """
-        # A heading and empty lines are no events.
-        self._row_offset = first - self._clock.counts["events"]
         return self._restore_times(self._clock.feed(events))
 
     def close(self) -> Events:
@@ -49,8 +46,6 @@ class Sieve:
         return self._restore_times(self._clock.close())
 
     def _restore_times(self, pieces: list[Events]) -> Events:
-        for name, number in self._clock.firsts.items():
-            self._firsts.setdefault(name, number + self._row_offset)
         kept = []
         for piece in pieces:
             first_us = int(piece.t_us[0])
@@ -67,9 +62,9 @@ class Sieve:
     @property
     def losses(self) -> dict[str, Loss]:
         """As `EventSource.losses`."""
-        counts = self._clock.counts
+        counts, firsts = self._clock.counts, self._clock.firsts
         return {
-            name: Loss(counts[count], self._firsts[count], self._unit, meaning)
+            name: Loss(counts[count], self._first + firsts[count], self._unit, meaning)
             for name, (count, meaning) in _LOSSES.items()
             if counts[count]
         }

@@ -8,8 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any, Final
 
-import numpy as np
-
 from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
 from evlcp_sdk.formatting import suggest
 from evlcp_sdk.io.evt import EVT3
@@ -91,14 +89,14 @@ def open_camera(url: str) -> "CameraSource":
     configuration = _make_configuration(url, kind, options)
     with _explain_faults(url):
         device = driver.open(
-            replace(configuration, biases=kind.Biases()),
+            configuration,
             raw=True,
             iterator_timeout=_WAIT_S,
             serial=serial or known[0].serial,
             ring_configuration=kind.RingConfiguration(ring_length=_RING_PACKETS),
         )
     try:
-        _set_biases(url, kind, device, configuration)
+        _set_biases(url, kind, device, configuration, options)
         properties = device.properties()
         return CameraSource(url, device, int(properties.width), int(properties.height))
     except BaseException:
@@ -252,8 +250,7 @@ def _make_configuration(url: str, kind: Any, options: Mapping[str, Any]) -> Any:
     for name in options:
         if name not in known:
             raise InputError(f"{url}: option {name!r}{suggest(name, known)}")
-    biases = {name: value for name, value in options.items() if name not in _OPTIONS}
-    settings: dict[str, Any] = {"biases": replace(kind.Biases(), **biases)}
+    settings: dict[str, Any] = {}
     if "trigger" in options:
         settings["enable_external_trigger"] = options["trigger"]
     if "events_per_s" in options:
@@ -277,20 +274,19 @@ def _make_masks(url: str, kind: Any, areas: Sequence[tuple[int, int, int, int]])
     return {"x_mask": mask.x_mask(), "y_mask": mask.y_mask()}
 
 
-def _set_biases(url: str, kind: Any, device: Any, configuration: Any) -> None:
+def _set_biases(url: str, kind: Any, device: Any, configuration: Any, options: Mapping[str, Any]) -> None:
     """Set biases that are within the camera's bounds, which the driver does not check."""
-    if configuration.biases == kind.Biases():
+    biases = {name: value for name, value in options.items() if name not in _OPTIONS}
+    if not biases:
         return
     with _explain_faults(url):
         bounds = device.biases_bounds()
-    for field in fields(configuration.biases):
-        value, default = (getattr(some, field.name) for some in (configuration.biases, kind.Biases()))
-        limits = getattr(bounds, field.name)
-        if value != default and not int(limits.minimum) <= value <= int(limits.maximum):
+    for name, value in biases.items():
+        limits = getattr(bounds, name)
+        if not int(limits.minimum) <= value <= int(limits.maximum):
             raise ConfigError(
-                f"{url}: {field.name} = {value}: expected {int(limits.minimum)} to {int(limits.maximum)}"
+                f"{url}: {name} = {value}: expected {int(limits.minimum)} to {int(limits.maximum)}"
             )
-    biases = {f.name: np.int16(getattr(configuration.biases, f.name)) for f in fields(kind.Biases)}
     with _explain_faults(url):
         device.update_configuration(replace(configuration, biases=kind.Biases(**biases)))
 

@@ -140,8 +140,8 @@ class ColumnSource(EventSource):
         if not unit:
             self._unit = infer_time_unit(times, table.unit, share, has_pixels=has_pixels)
         self._polarities = Polarities()
-        self._sieve = Sieve(table.row_name, *table.size)
-        self._row = first.row_number(0) if first is not None and len(times) else 1
+        row = first.row_number(0) if first is not None and len(times) else 1
+        self._sieve = Sieve(table.row_name, row, *table.size)
         self._fault: InputError | None = None
         self._merged = _merge_triggers(self._sort_events(), table.triggers or iter(()))
         header = {
@@ -179,8 +179,7 @@ class ColumnSource(EventSource):
             # Unless all is read, the later half waits for events that may be earlier.
             due = len(events) // 2 if has_more else len(events)
             waiting = [events[due:]]
-            yield self._sieve.sift(events[:due], self._row)
-            self._row += due
+            yield self._sieve.sift(events[:due])
         yield self._sieve.close()
         if fault is not None:
             raise fault

@@ -48,7 +48,7 @@ class FaerySource(EventSource):
         except Exception as error:
             raise InputError(f"{path}: found no {name} file, expected one ({error})") from error
         width, height = (None, None) if size == UNKNOWN_SIZE else size
-        self._sieve = Sieve("row", width, height)
+        self._sieve = Sieve("row", 1, width, height)
         super().__init__(target, name, width, height, None, target.stat().st_size, self._sieve)
         self._packets: Iterator[Any] = iter(stream)
         self._row = 1
@@ -62,11 +62,10 @@ class FaerySource(EventSource):
         if packet is None:
             events = self._sieve.close()
             return (events, Triggers.empty()) if len(events) else None
-        first = self._row
         self._row += len(packet)
         columns = (packet["t"], packet["x"], packet["y"], packet["on"])
         events = Events.of(*(np.array(column) for column in columns))  # copies: faery may reuse the packet
-        return self._sieve.sift(events, first), Triggers.empty()
+        return self._sieve.sift(events), Triggers.empty()
 
     def close(self) -> None:
         """Close the file."""
