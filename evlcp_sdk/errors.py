@@ -100,18 +100,18 @@ class InterruptedRunError(EvlcpError):
     exit_code = 130
 
 
-def import_extra(module: str, extra: str) -> Any:
+def import_extra(module: str, extra: str, needed_by: str = "", error: type[EvlcpError] = ConfigError) -> Any:
     """Import a module of a package that comes with an extra.
 
     Raises:
-        ConfigError: It is not installed.
+        EvlcpError: It is not installed; the `error` names what it is `needed_by`, if that is given.
     """
     try:
         return import_module(module)
     except ImportError as fault:
-        package = module.partition(".")[0]
-        raise ConfigError(
-            f"{package} is not installed; it comes with the extra: pip install 'evlcp-sdk[{extra}]'"
+        package, start = module.partition(".")[0], f"{needed_by}: " if needed_by else ""
+        raise error(
+            f"{start}{package} is not installed; it comes with the extra: pip install 'evlcp-sdk[{extra}]'"
         ) from fault
 
 
@@ -130,7 +130,7 @@ def explain_fault(fault: BaseException) -> tuple[str, int]:
     if isinstance(fault, EvlcpError):
         return str(fault), fault.exit_code
     if isinstance(fault, MemoryError):
-        return f"not enough memory: {_short_message(fault)}", _FAILURE
+        return f"not enough memory: {short_message(fault)}", _FAILURE
     if isinstance(fault, OSError) and fault.filename is not None:
         return f"{fault.filename}: {fault.strerror}", _FAILURE
     return _report_line(fault), OWN_FAULT
@@ -148,7 +148,8 @@ def fault_message(fault: BaseException) -> str:
     return " ".join(str(fault).split()) or type(fault).__name__
 
 
-def _short_message(fault: BaseException) -> str:
+def short_message(fault: BaseException) -> str:
+    """The message of an exception in one line, its beginning where that is long."""
     return shorten(fault_message(fault), 200)
 
 
@@ -161,7 +162,7 @@ def _report_line(fault: BaseException) -> str:
 
     frames = traceback.extract_tb(fault.__traceback__)[-_MAX_PLACES:]
     return (
-        f"a fault of evlcp itself, not of what you gave: {type(fault).__name__}: {_short_message(fault)};"
+        f"a fault of evlcp itself, not of what you gave: {type(fault).__name__}: {short_message(fault)};"
         " please report the command, what it was given, and this line:"
         f" evlcp-sdk {version('evlcp-sdk')}, Python {platform.python_version()}, {platform.platform()},"
         f" at {' > '.join(map(place, frames))}"

@@ -11,8 +11,8 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.columns import PIECE_ROWS, WINDOW_US, EventTable, Piece, format_error
+from evlcp_sdk.errors import InputError, short_message
+from evlcp_sdk.io.columns import PIECE_ROWS, WINDOW_US, EventTable, Piece
 from evlcp_sdk.io.fields import Fields, fields_from_names, fields_from_values
 from evlcp_sdk.io.tables import COLUMNS, LAST_VALUES, TRIGGER_COLUMNS, WIRE_TYPES
 from evlcp_sdk.values import Triggers
@@ -147,7 +147,7 @@ def _map_array(name: str, file: Path) -> NDArray[Any]:
         return to_upright(np.lib.format.open_memmap(file, mode="r"))
     except Exception as error:
         # NumPy evaluates the header as Python, which may fail in any way.
-        raise InputError(f"{name}: found no array of numbers ({format_error(error)})") from error
+        raise InputError(f"{name}: found no array of numbers ({short_message(error)})") from error
 
 
 def read_npy(path: Path, _: ExitStack, fields: Fields | None) -> EventTable:
@@ -177,7 +177,7 @@ def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
             file = archive.extract(f"{name}.npy", folder)
         except Exception as error:
             # Codecs and encryption fail in many ways.
-            raise InputError(f"{path}: array {name}: damaged: {format_error(error)}") from error
+            raise InputError(f"{path}: array {name}: damaged: {short_message(error)}") from error
         return _map_array(f"{path}: array {name}", Path(file))
 
     columns, found = choose_columns(path, names, load, fields)

@@ -1,14 +1,13 @@
 """Open cameras by the driver `neuromorphic-drivers`: the EVK4, others with its chip's bus, the EVK3 HD."""
 
 import contextlib
-import importlib
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any, Final
 
-from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
+from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError, import_extra
 from evlcp_sdk.formatting import suggest
 from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import ChunkReader, RawSource, format_header
@@ -65,12 +64,7 @@ def open_camera(url: str) -> "CameraSource":
         ConfigError: The extra is not installed, or an option is not known or out of its bounds.
         InputError: There is no such camera, or it cannot be opened.
     """
-    try:
-        driver: Any = importlib.import_module("neuromorphic_drivers")
-    except ImportError as fault:
-        raise ConfigError(
-            f"{url}: needs the driver, which comes with the extra: pip install 'evlcp-sdk[camera]'"
-        ) from fault
+    driver = import_extra("neuromorphic_drivers", "camera", url)
     biases = [field.name for kind in _MODULES.values() for field in fields(getattr(driver, kind).Biases)]
     name, options = split_options(url, _OPTIONS | dict.fromkeys(biases, _parse_integer))
     serial = name.partition(":")[2].removeprefix("//") or None

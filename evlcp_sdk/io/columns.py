@@ -14,8 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import InputError, fault_message
-from evlcp_sdk.formatting import shorten
+from evlcp_sdk.errors import InputError, short_message
 from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.io.fields import Polarities, RowError, TimeUnit, infer_time_unit
 from evlcp_sdk.plugin.source import EventSource, Loss
@@ -119,7 +118,7 @@ class ColumnSource(EventSource):
             except DAMAGE as error:
                 what = error.strerror if isinstance(error, OSError) else None
                 raise InputError(
-                    f"{path}: {what or f'damaged or closed file: {format_error(error)}'}"
+                    f"{path}: {what or f'damaged or closed file: {short_message(error)}'}"
                 ) from error
             self._read_first_piece(table, size_bytes, unit, inverted)
             self._stack = stack.pop_all()
@@ -188,7 +187,7 @@ class ColumnSource(EventSource):
         try:
             piece = next(self._pieces, None)
         except DAMAGE as error:
-            raise InputError(f"{self.path}: damaged or closed file: {format_error(error)}") from error
+            raise InputError(f"{self.path}: damaged or closed file: {short_message(error)}") from error
         self._position = self._end if piece is None else piece.end_bytes
         return piece
 
@@ -359,8 +358,3 @@ def _to_pixels(places: NDArray[Any]) -> NDArray[np.uint16]:
         row = int(wrong.argmax())
         raise RowError(row, f"place {places[row]}, expected whole numbers from 0 to {_MAX_SIDE - 1}")
     return places.astype(np.uint16)
-
-
-def format_error(error: Exception) -> str:
-    """Return the message of an error in one line."""
-    return shorten(fault_message(error), 200)

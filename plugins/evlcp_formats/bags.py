@@ -1,6 +1,5 @@
 """ROS bags with `event_camera_msgs/EventPacket`, EVT3 inside: ROS 1, and ROS 2 in SQLite or MCAP."""
 
-import importlib
 import re
 import sqlite3
 import struct
@@ -13,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
-from evlcp_sdk.errors import InputError
+from evlcp_sdk.errors import InputError, import_extra
 from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import ChunkReader, RawSource, format_header
 from evlcp_sdk.io.urls import split_options
@@ -290,7 +289,8 @@ def _limit_sqlite(base: sqlite3.Connection, path: Path) -> None:
 
 
 def _read_mcap(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    reader = _import_extra(path, "mcap.reader").make_reader(stack.enter_context(path.open("rb")))
+    mcap = import_extra("mcap.reader", "ros", str(path), InputError)
+    reader = mcap.make_reader(stack.enter_context(path.open("rb")))
     summary = reader.get_summary()
     schemas = summary.schemas if summary is not None else {}
     channels = summary.channels.values() if summary is not None else ()
@@ -300,7 +300,8 @@ def _read_mcap(path: Path, topic: str | None, stack: ExitStack) -> Iterator[Even
 
 
 def _read_ros1(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    reader = stack.enter_context(_import_extra(path, "rosbags.rosbag1").Reader(path))
+    rosbag1 = import_extra("rosbags.rosbag1", "ros", str(path), InputError)
+    reader = stack.enter_context(rosbag1.Reader(path))
     chosen = _choose_topic(path, {one.topic: one.msgtype for one in reader.connections}, topic)
     for _, _, data in reader.messages([one for one in reader.connections if one.topic == chosen]):
         yield _parse_ros1(path, data)
@@ -311,13 +312,6 @@ _READERS: Final = {
     b"SQLite format 3": _read_sqlite,
     b"\x89MCAP0\r\n": _read_mcap,
 }
-
-
-def _import_extra(path: Path, module: str) -> Any:
-    try:
-        return importlib.import_module(module)
-    except ImportError as fault:
-        raise InputError(f"{path}: needs the extra: pip install 'evlcp-sdk[ros]'") from fault
 
 
 def _parse_cdr(path: Path, data: bytes) -> EventPacket:

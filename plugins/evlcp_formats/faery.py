@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from evlcp_sdk.errors import InputError
+from evlcp_sdk.errors import InputError, import_extra
 from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
@@ -36,12 +36,7 @@ class FaerySource(EventSource):
         name, kind = _FORMATS[target.suffix.lower()]
         if not target.is_file():
             raise InputError(f"{path}: {'not a file' if target.exists() else 'No such file or directory'}")
-        try:
-            import faery
-        except ImportError as error:
-            raise InputError(
-                f"{path}: reading {name} takes the package faery: pip install 'evlcp-sdk[faery]'"
-            ) from error
+        faery = import_extra("faery", "faery", str(path), InputError)
         try:
             stream = faery.events_stream_from_file(target, dimensions_fallback=UNKNOWN_SIZE, file_type=kind)
             size = stream.dimensions()

@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from evlcp_sdk.errors import InputError
+from evlcp_sdk.errors import InputError, short_message
 from evlcp_sdk.io.arrays import Array, choose_columns, split_pieces
-from evlcp_sdk.io.columns import WINDOW_US, ColumnSource, EventTable, format_error
+from evlcp_sdk.io.columns import WINDOW_US, ColumnSource, EventTable
 from evlcp_sdk.io.fields import Fields, fields_from_names, parse_unit
 from evlcp_sdk.io.urls import parse_flag, split_options
 from evlcp_sdk.lazy import LazyModule
@@ -70,7 +70,7 @@ def _read_file(path: Path, stack: ExitStack, order: Fields | None, swapped: bool
         raise InputError(f"{path}: needs the extra: pip install 'evlcp-sdk[hdf5]'") from fault
     except Exception as fault:
         # A damaged file makes h5py fail in any way.
-        raise InputError(f"{path}: found no HDF5 file, or a damaged one ({format_error(fault)})") from fault
+        raise InputError(f"{path}: found no HDF5 file, or a damaged one ({short_message(fault)})") from fault
     if swapped:
         columns[2:] = columns[:1:-1]
     pieces = split_pieces(columns, path.stat().st_size)
@@ -103,7 +103,7 @@ class _DataSet:
                 block = np.asarray(self._dataset[:, key].T if self._on_its_side else self._dataset[key])
             except Exception as fault:
                 raise InputError(
-                    f"{self._path}: row {(key.start or 0) + 1}: damaged: {format_error(fault)}"
+                    f"{self._path}: row {(key.start or 0) + 1}: damaged: {short_message(fault)}"
                 ) from fault
             self._block[:] = key, block
         return self._block[1][self._part]

@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import InputError
+from evlcp_sdk.errors import InputError, short_message
 from evlcp_sdk.io.arrays import choose_columns, split_pieces, to_upright
-from evlcp_sdk.io.columns import ColumnSource, EventTable, format_error
+from evlcp_sdk.io.columns import ColumnSource, EventTable
 from evlcp_sdk.io.fields import Fields
 from evlcp_sdk.io.lists import open_list
 
@@ -45,7 +45,7 @@ def _load_arrays(path: Path) -> dict[str, NDArray[Any]]:
         raise
     except Exception as error:
         # A damaged file makes SciPy fail in any way.
-        raise InputError(f"{path}: found no MAT file, expected one ({format_error(error)})") from error
+        raise InputError(f"{path}: found no MAT file, expected one ({short_message(error)})") from error
 
     arrays: dict[str, NDArray[Any]] = {}
 

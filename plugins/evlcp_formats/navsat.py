@@ -27,7 +27,7 @@ class NavSat(Sink):
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
-        self._bag = RosBag(folder.open_binary("navsat.mcap"))
+        self._bag = RosBag(folder.open_binary("navsat.mcap"), "navsat.mcap")
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a message."""

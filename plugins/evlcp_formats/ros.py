@@ -4,7 +4,7 @@ from typing import IO, Any, Final
 
 import numpy as np
 
-from evlcp_sdk.errors import ConfigError, import_extra
+from evlcp_sdk.errors import import_extra
 from evlcp_sdk.io.raw import RawWriter
 from evlcp_sdk.values import Events, Triggers
 
@@ -27,8 +27,8 @@ class RosBag:
         ConfigError: `mcap` or `rosbags` is not installed.
     """
 
-    def __init__(self, file: IO[bytes]) -> None:
-        writer, typesys = (import_extra(name, "ros") for name in ("mcap.writer", "rosbags.typesys"))
+    def __init__(self, file: IO[bytes], name: str) -> None:
+        writer, typesys = (import_extra(one, "ros", name) for one in ("mcap.writer", "rosbags.typesys"))
         self._store: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         for kind, text in _DEFINITIONS.items():
             self._store.register(typesys.get_types_from_msg(text, kind))
@@ -76,10 +76,7 @@ class EventBagWriter(RawWriter):
     _seq = 0
 
     def _begin(self) -> None:
-        try:
-            self._bag = RosBag(self._file)
-        except ConfigError as fault:
-            raise ConfigError(f"{self.path}: {fault}") from fault
+        self._bag = RosBag(self._file, str(self.path))
 
     def _write(self, events: Events, triggers: Triggers) -> None:
         turns = [np.unique(column // _PACKET_US) for column in (events.t_us, triggers.t_us)]

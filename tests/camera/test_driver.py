@@ -236,7 +236,7 @@ def test_options_are_checked(monkeypatch):
         with pytest.raises(InputError) as fault:
             open_source(url)
         assert message in str(fault.value)
-    monkeypatch.setattr(camera.importlib, "import_module", Mock(side_effect=ImportError))
+    monkeypatch.setitem(sys.modules, "neuromorphic_drivers", None)
     with pytest.raises(ConfigError, match=r"pip install 'evlcp-sdk\[camera\]'"):
         open_source("camera:")
 
