@@ -70,9 +70,8 @@ class Outputs:
     def __init__(self) -> None:
         self._stages: dict[Path, Path] = {}
         self._staged: dict[Path, Path] = {}
-        self._direct: list[Path] = []
         self._dropped: list[Path] = []
-        self._open: list[IO[Any]] = []
+        self._open: list[tuple[Path, IO[Any]]] = []
 
     def path(self, target: Path) -> Path:
         """Where to write a file that `commit` moves to `target`; nothing is there yet.
@@ -82,11 +81,8 @@ class Outputs:
         """
         if target in self._staged:
             return self._staged[target]
-        if target in self._direct:
-            return target
         with writing(target):
             if _is_special(target):
-                self._direct.append(target)
                 return target
             if target.parent not in self._stages:
                 self._stages[target.parent] = Path(tempfile.mkdtemp(prefix=STAGE_PREFIX, dir=target.parent))
@@ -108,8 +104,9 @@ class Outputs:
 
     def _open_file(self, target: Path, kind: str, **text: str) -> IO[Any]:
         path = self.path(target)
-        self._open.append(path.open(f"{'w' if target in self._direct else 'x'}{kind}", **text))  # type: ignore[call-overload]
-        return self._open[-1]
+        file: IO[Any] = path.open(f"{'w' if path == target else 'x'}{kind}", **text)  # type: ignore[call-overload]
+        self._open.append((target, file))
+        return file
 
     def write_text(self, text: str, target: Path) -> None:
         """Write a text file.
@@ -144,7 +141,7 @@ class Outputs:
         Raises:
             OSError: Something cannot be written or read back.
         """
-        for file in self._open:
+        for _, file in self._open:
             file.close()
         digests = {}
         for target, staged in self._staged.items():
@@ -160,8 +157,8 @@ class Outputs:
         Raises:
             OutputError: A file cannot be written; an earlier result stays, unless files were already moved.
         """
-        with writing(next(iter((*self._staged, *self._direct)), Path())):
-            for file in self._open:
+        for target, file in self._open:
+            with writing(target):
                 file.close()
         written = {target: staged for target, staged in self._staged.items() if staged.exists()}
         for target, staged in written.items():
@@ -206,7 +203,7 @@ class Outputs:
 
     def discard(self) -> None:
         """Remove what has not come into place."""
-        for file in self._open:
+        for _, file in self._open:
             # A file that could not be written cannot be flushed either.
             with suppress(OSError):
                 file.close()

@@ -1,6 +1,7 @@
 """RAW words from the network and from other programs: TCP, UDP, Unix sockets."""
 
 import socket
+from contextlib import ExitStack
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -109,25 +110,20 @@ _HINTS: Final = {
 
 
 def _open_socket(scheme: str, url: str) -> socket.socket:
-    if scheme == "tcp":
-        sock = socket.create_connection(_parse_address(url), _CONNECT_S)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BYTES)
-        return sock
-    if scheme == "unix":
-        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    else:
-        address = _parse_address(url)
-        sock = socket.socket(socket.AF_INET6 if ":" in address[0] else socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        if scheme == "unix":
+    with ExitStack() as stack:
+        if scheme == "tcp":
+            sock = stack.enter_context(socket.create_connection(_parse_address(url), _CONNECT_S))
+        elif scheme == "unix":
+            sock = stack.enter_context(socket.socket(socket.AF_UNIX))
             sock.settimeout(_CONNECT_S)
             sock.connect(url.partition(":")[2].removeprefix("//"))
         else:
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BYTES)
+            address = _parse_address(url)
+            family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+            sock = stack.enter_context(socket.socket(family, socket.SOCK_DGRAM))
             sock.bind(address)
-    except BaseException:
-        sock.close()
-        raise
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BYTES)
+        stack.pop_all()
     return sock
 
 

@@ -1,8 +1,8 @@
 """The formats that few use: bags, HDF5, MAT, AEDAT4, DAT, ES; Parquet, KML, MCAP."""
 
-from collections.abc import Callable, Iterator
-from importlib import import_module
+from collections.abc import Iterator
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
 from evlcp_sdk.errors import InputError
@@ -51,11 +51,8 @@ def evlcp_open_events(url: str) -> "EventSource | None":
 
 
 def _open_as(url: str, format: str) -> "EventSource | None":
-    if not format:
-        return None
-    module, _, name = _OPENERS[format].partition(":")
-    opener: Callable[[str], EventSource] = getattr(import_module(module), name)
-    return opener(url)
+    source: EventSource | None = resolve_name(_OPENERS[format])(url) if format else None
+    return source
 
 
 def _detect_format(name: str) -> str:
