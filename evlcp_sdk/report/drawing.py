@@ -4,14 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullLocator, StrMethodFormatter
 
 from evlcp_sdk.files import Outputs, writing
-from evlcp_sdk.report.plots import INK, WIDTHS_PX, Plot, Shape, log_ticks
+from evlcp_sdk.report.plots import INK, WIDTHS_PX, Plot, Shape, log_ticks, set_scales
 
 INK_COLOUR = "#333333"
 
@@ -64,17 +63,11 @@ def _draw_axes(axis: Axes, plot: Plot) -> None:
             text, (x, y), xytext=(0, 3), textcoords="offset points", fontsize=8, color=INK_COLOUR,
             ha="right" if x < middle else "left", path_effects=[withStroke(linewidth=3, foreground="white")],
         )  # fmt: skip
+    set_scales(axis, plot)
     if plot.log_y:
-        axis.set_yscale("log")
-        axis.set_yticks(log_ticks(*np.log10(axis.get_ylim())))
+        axis.set_yticks(log_ticks(*axis.get_ylim()))
         axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axis.yaxis.set_minor_locator(NullLocator())
-    if plot.from_zero:
-        axis.set_ylim(bottom=0)
-    if plot.y_limits is not None:
-        axis.set_ylim(*plot.y_limits)
-    if plot.aspect is not None:
-        axis.set_aspect("equal", adjustable="datalim")
     axis.set(xlabel=plot.x_name, ylabel=plot.y_name)
     style_axes(axis)
 

@@ -17,7 +17,7 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import transmitter_colour
 from evlcp_sdk.report.motion import MotionCollector
 from evlcp_sdk.report.pages import render_page
-from evlcp_sdk.report.plots import SCRIPT, Plot
+from evlcp_sdk.report.plots import SCRIPT, Plot, render_plot
 from evlcp_sdk.report.recording import (
     ChartSink,
     TimeAxis,
@@ -82,13 +82,15 @@ class Report(ChartSink):
         frame_plots = [*distances, plot_quality(frames, axis), self._plot_places(frames, axis)]
         plots = frame_plots * bool(self.transmitters) + (places or [])
         messages = [*self._messages, *self._latest]
-        # Labels exist once a chart is drawn.
-        charts = {plot.id: plot.to_markup() for plot in plots}
+        rendered = {plot.id: render_plot(plot) for plot in plots}
         page = render_page(
             "recording.html",
             f"{self.run.name}: report",
             [SCRIPT, files("evlcp_sdk.report").joinpath("report.js").read_text(encoding="utf-8")],
-            {"plots": {plot.id: plot.labels for plot in plots}, "report": {"motions": motions}},
+            {
+                "plots": {id: labels for id, (_, labels) in rendered.items()},
+                "report": {"motions": motions},
+            },
             name=self.run.name,
             summary=summary,
             figures=self._headline_figures(summary),
@@ -96,7 +98,7 @@ class Report(ChartSink):
             notes=[Diagnostic(**one) for one in summary["notes"]],
             counts={name: value for name, value in summary["counts"].items() if value},
             motions=motions,
-            charts=charts,
+            charts={id: chart for id, (chart, _) in rendered.items()},
             distances=distances,
             transmitters=self.transmitters,
             received=sum(one.count for one in self.transmitters.values()),
@@ -162,9 +164,9 @@ class Report(ChartSink):
             "column, px",
             "row, px",
             aspect=camera.width / camera.height,
-            down=True,
             x_limits=(0, camera.width),
-            y_limits=(0, camera.height),
+            # Rows grow downwards.
+            y_limits=(camera.height, 0),
         )
         for number, (name, frames) in shown.items():
             places = np.array([(frame.x_px, frame.y_px) for frame in frames])

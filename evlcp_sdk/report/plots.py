@@ -12,13 +12,15 @@ from importlib.resources import files
 
 import numpy as np
 from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.report.pages import TEMPLATES
 
 SCRIPT = files("evlcp_sdk.report").joinpath("plots.js").read_text(encoding="utf-8")
-"""Script of a page with charts; it reads `Plot.labels`, under `plots` of the page's data."""
+"""Script of a page with charts; it reads the labels of `render_plot`, under `plots` of the page's data."""
 
 INK = "var(--ink)"
 """The colour of the page's text."""
@@ -72,15 +74,13 @@ class Plot:
         note: For the reader.
         aspect: Width by height of its box, in which x and y then have one scale; None for a low wide box,
             filled by the data.
-        down: y grows downwards, as rows of an image do.
-        x_limits, y_limits: Ends of the axes; None for those of the data.
+        x_limits, y_limits: Ends of the axes, left and right, bottom and top; None for those of the data.
 
     Attributes:
         shapes: What is drawn.
         names: Texts beside points: x, y, text.
         legend: One of the shapes of each name.
-        labels: Texts at the pointer: x, y in thousandths of the box, a text, and the number of its name in
-            the legend or -1; after `to_markup`.
+        labels: Texts at the pointer: x, y, a text, and its name in the legend; empty for none.
     """
 
     id: str
@@ -89,7 +89,6 @@ class Plot:
     title: str = ""
     note: str = ""
     aspect: float | None = None
-    down: bool = False
     log_y: bool = False
     from_zero: bool = False
     x_limits: tuple[float, float] | None = None
@@ -97,8 +96,7 @@ class Plot:
     shapes: list[Shape] = field(default_factory=list)
     names: list[tuple[float, float, str]] = field(default_factory=list)
     legend: dict[str, Shape] = field(default_factory=dict)
-    labels: list[tuple[int, int, str, int]] = field(default_factory=list)
-    _pending_labels: list[tuple[float, float, str, str]] = field(default_factory=list)
+    labels: list[tuple[float, float, str, str]] = field(default_factory=list)
 
     def _add_shape(self, shape: Shape) -> None:
         self.shapes.append(shape)
@@ -116,7 +114,7 @@ class Plot:
     def add_labels(self, x: ArrayLike, y: ArrayLike, labels: Sequence[str], name: str = "") -> None:
         """Add texts for the pointer on these points."""
         points = _stack_points(x, y)
-        self._pending_labels += [
+        self.labels += [
             (px, py, text, name)
             for (px, py), text in zip(points.tolist(), labels, strict=False)
             if math.isfinite(px) and math.isfinite(py)
@@ -155,66 +153,63 @@ class Plot:
         """Whether nothing is drawn in it."""
         return not any(len(shape.points) for shape in self.shapes)
 
-    def to_markup(self) -> Markup:
-        """Render the chart as HTML."""
-        (x0, x1), (y0, y1) = limits = self._find_limits()
 
-        def place(points: Sequence[tuple[float, float]] | NDArray[np.float64]) -> NDArray[np.float64]:
-            share = (self._to_scale(np.reshape(points, (-1, 2))) - (x0, y0)) / (x1 - x0, y1 - y0)
-            if not self.down:
-                share[:, 1] = 1 - share[:, 1]
-            return share
+def set_scales(axis: Axes, plot: Plot) -> None:
+    """Set scale, limits and aspect of axes that hold a chart's points."""
+    if plot.log_y:
+        axis.set_yscale("log")
+    if plot.from_zero:
+        axis.set_ylim(bottom=0)
+    if plot.x_limits is not None:
+        axis.set_xlim(*plot.x_limits)
+    if plot.y_limits is not None:
+        axis.set_ylim(*plot.y_limits)
+    if plot.aspect is not None:
+        axis.set_aspect("equal", adjustable="datalim")
 
-        x_ticks, y_ticks = _linear_ticks(*limits[0]), (log_ticks if self.log_y else _linear_ticks)(*limits[1])
-        numbers = {name: i for i, name in enumerate(self.legend)}
-        label_places = place([(x, y) for x, y, _, _ in self._pending_labels]).tolist()
-        self.labels = [
-            (round(1000 * x), round(1000 * y), text, numbers.get(name, -1))
-            for (x, y), (_, _, text, name) in zip(label_places, self._pending_labels, strict=True)
-        ]
-        html = TEMPLATES.get_template("plot.html").render(
-            plot=self,
-            side=_BOX_STEPS,
-            columns=list(zip(x_ticks, place([(x, 1.0) for x in x_ticks])[:, 0].tolist(), strict=True)),
-            rows=list(zip(y_ticks, place([(x0, y) for y in y_ticks])[:, 1].tolist(), strict=True)),
-            paths=[
-                (numbers.get(shape.name, -1), _shape_style(shape), _svg_path(place(shape.points), kind))
-                for kind in _SHAPE_STYLES
-                for shape in self.shapes
-                if shape.kind == kind and len(shape.points)
-            ],
-            names=[(*place([(x, y)])[0].tolist(), text) for x, y, text in self.names],
-            legend=[(name, _shape_style(shape)) for name, shape in self.legend.items()],
-        )
-        return Markup(html)
 
-    def _to_scale(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points on the scale of the axes; a logarithmic one has no 0."""
-        if not self.log_y:
-            return points
-        return np.column_stack([points[:, 0], np.log10(np.maximum(points[:, 1], 1e-300))])
+PlacedLabel = tuple[int, int, str, int]
+"""A text at the pointer: x, y in thousandths of the box, the text, and the number of its name or -1."""
 
-    def _find_limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        drawn = [shape.points for shape in self.shapes if len(shape.points)]
-        points = np.concatenate(drawn) if drawn else np.zeros((1, 2))
-        if self.log_y:
-            positive = points[points[:, 1] > 0]
-            points = self._to_scale(positive) if len(positive) else np.zeros((1, 2))
-        limits = []
-        for fixed, column in ((self.x_limits, 0), (self.y_limits, 1)):
-            low, high = float(points[:, column].min()), float(points[:, column].max())
-            margin = 0.04 * (high - low) or 0.5
-            limits.append(fixed or (low - margin, high + margin))
-        (x0, x1), (y0, y1) = limits
-        if self.from_zero:
-            y0 = 0.0
-        if self.aspect is not None and self.x_limits is None:
-            # One scale for both: the shorter side is extended.
-            more_x = (y1 - y0) * self.aspect - (x1 - x0)
-            more_y = (x1 - x0) / self.aspect - (y1 - y0)
-            x0, x1 = x0 - max(more_x, 0) / 2, x1 + max(more_x, 0) / 2
-            y0, y1 = y0 - max(more_y, 0) / 2, y1 + max(more_y, 0) / 2
-        return (x0, x1), (y0, y1)
+
+def render_plot(plot: Plot) -> tuple[Markup, list[PlacedLabel]]:
+    """Render a chart as HTML; its labels are for the page's script, under `plots` and the chart's id."""
+    axis = Figure((plot.aspect or 1, 1)).add_axes((0, 0, 1, 1))
+    for shape in plot.shapes:
+        axis.update_datalim(shape.points)
+    axis.autoscale_view()
+    set_scales(axis, plot)
+    axis.apply_aspect()
+    # Shares of the box are from the top.
+    axis.invert_yaxis()
+    to_box = axis.transData - axis.transAxes
+
+    def place(points: Sequence[tuple[float, float]] | NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(to_box.transform(np.reshape(points, (-1, 2))))
+
+    x_ticks = _linear_ticks(*axis.get_xbound())
+    y_ticks = log_ticks(*axis.get_ybound()) if plot.log_y else _linear_ticks(*axis.get_ybound())
+    numbers = {name: i for i, name in enumerate(plot.legend)}
+    html = TEMPLATES.get_template("plot.html").render(
+        plot=plot,
+        side=_BOX_STEPS,
+        columns=list(zip(x_ticks, place([(x, 1.0) for x in x_ticks])[:, 0].tolist(), strict=True)),
+        rows=list(zip(y_ticks, place([(0.0, y) for y in y_ticks])[:, 1].tolist(), strict=True)),
+        paths=[
+            (numbers.get(shape.name, -1), _shape_style(shape), _svg_path(place(shape.points), kind))
+            for kind in _SHAPE_STYLES
+            for shape in plot.shapes
+            if shape.kind == kind and len(shape.points)
+        ],
+        names=[(*place([(x, y)])[0].tolist(), text) for x, y, text in plot.names],
+        legend=[(name, _shape_style(shape)) for name, shape in plot.legend.items()],
+    )
+    places = np.rint(1000 * place([(x, y) for x, y, _, _ in plot.labels])).astype(int).tolist()
+    labels = [
+        (x, y, text, numbers.get(name, -1))
+        for (x, y), (_, _, text, name) in zip(places, plot.labels, strict=True)
+    ]
+    return Markup(html), labels
 
 
 def _shape_style(shape: Shape) -> str:
@@ -227,10 +222,10 @@ def _linear_ticks(low: float, high: float) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """Ticks of a logarithmic axis from 10^low to 10^high; even ones over less than a step of 1, 2, 5."""
-    ticks = LogLocator(subs=(1.0, 2.0, 5.0) if high - low < 2 else (1.0,)).tick_values(10**low, 10**high)
-    inside = [float(v) for v in ticks if low <= math.log10(v) <= high]
-    return inside if len(inside) > 1 else _linear_ticks(10**low, 10**high)
+    """Ticks of a logarithmic axis between two numbers; even ones over less than a step of 1, 2, 5."""
+    ticks = LogLocator(subs=(1.0, 2.0, 5.0) if high < 100 * low else (1.0,)).tick_values(low, high)
+    inside = [float(v) for v in ticks if low <= v <= high]
+    return inside if len(inside) > 1 else _linear_ticks(low, high)
 
 
 def _stack_points(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:

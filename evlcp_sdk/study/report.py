@@ -12,7 +12,7 @@ from markupsafe import Markup
 from evlcp_sdk.formatting import format_count
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS
 from evlcp_sdk.report.pages import render_page
-from evlcp_sdk.report.plots import DASHES, INK, SCRIPT, Plot
+from evlcp_sdk.report.plots import DASHES, INK, SCRIPT, Plot, render_plot
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, INTERVALS, Figure, format_number, measure_figure
 from evlcp_sdk.study.plan import digest_of
 from evlcp_sdk.study.summary import (
@@ -174,17 +174,16 @@ def render_campaign(summary: Summary) -> str:
     def mark_verdict(verdict: str) -> Markup:
         return Markup('<span class="{}">{}</span>').format(_VERDICT_CLASSES[verdict], verdict)
 
-    # Labels exist once a chart is drawn.
-    drawn = [(chart, chart.to_markup()) for chart in charts]
+    rendered = [(chart, *render_plot(chart)) for chart in charts]
     rule = summary.plan.rule
     return render_page(
         "campaign.html",
         summary.plan.name,
         [SCRIPT],
-        {"plots": {chart.id: chart.labels for chart in charts}},
+        {"plots": {chart.id: labels for chart, _, labels in rendered}},
         summary=summary,
         about=_progress_text(summary),
-        charts=drawn,
+        charts=[(chart, markup) for chart, markup, _ in rendered],
         comparisons=[[*row[:-1], mark_verdict(row[-1])] for row in paper_rows(comparisons)],
         paper=PAPER_NAME,
         paper_head=PAPER_HEAD,

@@ -100,7 +100,6 @@ def test_a_limit_stands_above_the_paper_for_no_want_of_data(summary: Summary) ->
     at = Statistics.of([(m, Tally.of_distance(0.0)) for m in (30, 40, 50) for _ in range(400)], tasks=1)
     series = Series({"scene.speed_kmh": 30}, {"speed_kmh": 30}, summary.series[0].link, (at,))
     (gross,) = (one for one in draw_charts(replace(summary, series=(series,))) if one.id == "gross")
-    gross.to_markup()
     (shown,) = [text.splitlines()[1] for *_, text, _ in gross.labels if text.startswith(series.name)]
     assert shown.startswith("30 to 60 m: below 0.0031")
 
