@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Literal
 
 from evlcp_sdk.errors import ConfigError, import_extra
@@ -43,21 +44,18 @@ def frame_value(frame: Frame, column: str) -> Any:
     `symbols` is a list, None for a symbol that is not given; a distance that is not given is NaN; `echo_of`
     is None where the frame is not a reflection.
     """
-    match column:
-        case "symbols":
-            return list_symbols(frame.soft)
-        case "quality":
-            return frame.soft.quality
-        case "distance_m":
-            return frame.range.distance_m
-        case "distance_sigma_m":
-            return frame.range.sigma_m
-        case "distance_filtered_m":
-            return math.nan if frame.filtered is None else frame.filtered.distance_m
-        case "distance_filtered_sigma_m":
-            return math.nan if frame.filtered is None else frame.filtered.sigma_m
-        case _:
-            return getattr(frame, column)
+    return _VALUES.get(column, attrgetter(column))(frame)
+
+
+_VALUES: Mapping[str, Callable[[Frame], Any]] = {
+    "symbols": lambda frame: list_symbols(frame.soft),
+    "quality": attrgetter("soft.quality"),
+    "distance_m": attrgetter("range.distance_m"),
+    "distance_sigma_m": attrgetter("range.sigma_m"),
+    "distance_filtered_m": lambda frame: getattr(frame.filtered, "distance_m", math.nan),
+    "distance_filtered_sigma_m": lambda frame: getattr(frame.filtered, "sigma_m", math.nan),
+}
+"""Values of columns that are no attributes of a frame."""
 
 
 def list_symbols(soft: SoftSymbols) -> list[int | None]:
