@@ -7,26 +7,20 @@ from typing import Any
 from evlcp_sdk.formatting import round_or_none
 from evlcp_sdk.results.columns import FRAME_COLUMNS, frame_columns, frame_value, list_symbols
 from evlcp_sdk.results.packets_jsonl import message_line
+from evlcp_sdk.results.sink import Run
 from evlcp_sdk.values import Fix, Frame, Packet, sigmas
 
 
 class JsonLines:
     """Writes a line for each frame, message and fix as it comes, without its end; its key `line` is the kind.
 
-    Where there are several links, `links_of` gives the names of those that a fix is computed from.
+    Where there are several links, a fix has the names of those that it is computed from.
     """
 
-    def __init__(
-        self,
-        write: Callable[[str], None],
-        *,
-        filtered: bool = False,
-        links: bool = False,
-        links_of: Callable[[Fix], str] | None = None,
-    ) -> None:
+    def __init__(self, write: Callable[[str], None], run: Run) -> None:
         self._write = write
-        self._links_of = links_of
-        self._columns = frame_columns(filtered=filtered, links=links)
+        self._navigator = run.navigator if run.links else None
+        self._columns = frame_columns(filtered=run.filtered, links=bool(run.links))
 
     def packet(self, packet: Packet) -> None:
         """Write the lines of a packet: its frames, and then the messages that it completes.
@@ -41,7 +35,8 @@ class JsonLines:
 
     def fix(self, fix: Fix) -> None:
         """Write the line of a fix, given or refused."""
-        links = {"link": self._links_of(fix)} if self._links_of is not None else {}
+        navigator = self._navigator
+        links = {} if navigator is None else {"link": navigator.positioner.links_of(fix)}
         self._write(json.dumps(fix_line(fix) | links))
 
 

@@ -1,23 +1,17 @@
 """All sinks of one run as one, with the name of the one that fails."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from evlcp_sdk.errors import EvlcpError, PluginError, describe_plugin_fault
 from evlcp_sdk.files import writing
 from evlcp_sdk.plugin.records import InstalledSink
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.values import Events, Packet
-
-if TYPE_CHECKING:
-    from evlcp_sdk.place.navigator import Placed, Settled
 
 
 def load_sinks(sinks: Sequence[InstalledSink]) -> list[tuple[InstalledSink, type[Sink]]]:
@@ -37,7 +31,7 @@ def load_sinks(sinks: Sequence[InstalledSink]) -> list[tuple[InstalledSink, type
 
 
 class Sinks:
-    """Passes the results of a run to each of its sinks.
+    """The sinks of a run, in the order in which they are called.
 
     An exception of a sink becomes a `PluginError` that names it, or an `OutputError` where a file cannot be
     written.
@@ -50,7 +44,7 @@ class Sinks:
     def open(
         self, classes: Sequence[tuple[InstalledSink, type[Sink]]], folder: ResultFolder, run: Run
     ) -> None:
-        """Create sinks of these classes; they are called in this order.
+        """Create sinks of these classes.
 
         Raises:
             OutputError: A file cannot be opened.
@@ -65,23 +59,11 @@ class Sinks:
         """The sinks."""
         return tuple(sink for _, sink in self._sinks)
 
-    def events(self, events: Events) -> None:
-        """Pass on events."""
-        self._call_all(lambda sink: sink.events(events))
-
-    def packet(self, packet: Packet) -> None:
-        """Pass on a packet."""
-        self._call_all(lambda sink: sink.packet(packet))
-
-    def fix(self, placed: Placed) -> None:
-        """Pass on a fix, and those that are smoothed with it."""
-        self._call_all(lambda sink: sink.fix(placed.fix, placed.filtered))
-        if placed.settled:
-            self.settle(placed.settled)
-
-    def settle(self, settled: Sequence[Settled]) -> None:
-        """Pass on smoothed fixes."""
-        self._call_all(lambda sink: sink.settle(settled))
+    def call(self, method: str, *arguments: Any) -> None:
+        """Call a method of each sink."""
+        for installed, sink in self._sinks:
+            with self._blame(installed):
+                getattr(sink, method)(*arguments)
 
     def finish(self) -> dict[str, Mapping[str, Any]]:
         """Finish the sinks; return their parts of the summary, by name."""
@@ -98,14 +80,10 @@ class Sinks:
         return parts
 
     def conclude(self, summary: Mapping[str, Any]) -> None:
-        """Pass on the summary, all but its `files`."""
-        # A copy, so that a sink cannot change summary.json.
-        self._call_all(lambda sink: sink.conclude(deepcopy(dict(summary))))
-
-    def _call_all(self, call: Callable[[Sink], None]) -> None:
+        """Pass on the summary, to each a copy, so that none can change `summary.json`."""
         for installed, sink in self._sinks:
             with self._blame(installed):
-                call(sink)
+                sink.conclude(deepcopy(dict(summary)))
 
     @contextmanager
     def _blame(self, installed: InstalledSink) -> Iterator[None]:

@@ -86,12 +86,7 @@ class ResultWriter:
         several = self._links if len(self._links) > 1 else {}
         self._pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
         run = Run(name, first, plan, self._navigator, clock_zero, several)
-        self._lines = None
-        if lines is not None:
-            links_of = (
-                self._navigator.positioner.links_of if several and self._navigator is not None else None
-            )
-            self._lines = JsonLines(lines, filtered=run.filtered, links=bool(several), links_of=links_of)
+        self._lines = None if lines is None else JsonLines(lines, run)
         self._folder: ResultFolder | None = None
         self._sinks = Sinks()
         with ExitStack() as stack:
@@ -108,7 +103,7 @@ class ResultWriter:
         self._readout.add(events)
         if self._navigator is not None and len(events):
             self._navigator.extend_span(int(events.t_us[0]), int(events.t_us[-1]))
-        self._sinks.events(events)
+        self._sinks.call("events", events)
 
     def write(self, packets: Iterable[Packet]) -> None:
         """Take the receiver's next packets.
@@ -119,7 +114,7 @@ class ResultWriter:
         """
         for packet in packets:
             self._tally.add(packet)
-            self._sinks.packet(packet)
+            self._sinks.call("packet", packet)
             if self._lines is not None:
                 self._lines.packet(packet)
             if self._navigator is not None:
@@ -139,7 +134,7 @@ class ResultWriter:
         if self._navigator is not None:
             fixes, settled = self._navigator.close()
             self._write_fixes(fixes)
-            self._sinks.settle(settled)
+            self._sinks.call("settle", settled)
             positions = self._positions.to_dict(self._navigator)
         facts = self._collect_facts(end, positions)
         table = build_summary(
@@ -195,7 +190,9 @@ class ResultWriter:
     def _write_fixes(self, fixes: Iterable[Placed]) -> None:
         for placed in fixes:
             self._positions.add(placed)
-            self._sinks.fix(placed)
+            self._sinks.call("fix", placed.fix, placed.filtered)
+            if placed.settled:
+                self._sinks.call("settle", placed.settled)
             if self._lines is not None:
                 self._lines.fix(placed.fix)
             if self._on_fix is not None:
