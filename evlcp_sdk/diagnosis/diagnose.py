@@ -10,9 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.diagnosis.checks import assess_stages
-from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, find_other_codewords
+from evlcp_sdk.diagnosis.facts import Diagnostic, Facts
 from evlcp_sdk.diagnosis.light import LightSource, LightSurvey
-from evlcp_sdk.diagnosis.probe import MAX_EVENTS, Trial, infer_links, try_changes, try_link
+from evlcp_sdk.diagnosis.probe import (
+    MAX_EVENTS,
+    Trial,
+    find_other_codewords,
+    infer_links,
+    try_changes,
+    try_link,
+)
 from evlcp_sdk.diagnosis.tallies import RunTally
 from evlcp_sdk.io.describe import check_sensor
 from evlcp_sdk.io.open import open_source

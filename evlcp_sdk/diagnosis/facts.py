@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.diagnosis.tallies import SURE, RunTally
-from evlcp_sdk.errors import EvlcpError
-from evlcp_sdk.link.resolve import Link, resolve
-from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.source import Loss
 
 if TYPE_CHECKING:
@@ -233,22 +231,6 @@ class Facts:
 def has_rate(source: LightSource, rate_hz: float) -> bool:
     """Whether a source may have this rate, or a multiple of it."""
     return source.strength_at(rate_hz) >= NEAR_RATE * source.strength
-
-
-def find_other_codewords(link: Link, registry: Registry) -> dict[str, NDArray[np.uint8]]:
-    """Codewords of the other installed modulations, by id, uint8 (symbols, chips)."""
-    codewords: dict[str, NDArray[np.uint8]] = {}
-    if "modulation" not in link.table:
-        return codewords
-    for installed in registry.list_algorithms("modulation"):
-        name = installed.algorithm.id
-        if name == link.table["modulation"]["id"]:
-            continue
-        try:
-            codewords[name] = resolve({**link.table, "modulation": {"id": name}}, registry).codebook.codewords
-        except EvlcpError:
-            continue
-    return codewords
 
 
 def format_ms(t_us: float) -> str:

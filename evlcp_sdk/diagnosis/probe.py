@@ -5,6 +5,9 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from evlcp_sdk.diagnosis.tallies import SURE, RunTally, count_missing_codewords
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.link.resolve import Link, resolve
@@ -115,11 +118,10 @@ def try_changes(
     """
     best = try_link(link, events)
     yield best
-    others = [one.algorithm.id for one in registry.list_algorithms("modulation")]
+    others, chips = find_other_codewords(link, registry), link.codebook.codewords.shape[-1]
     # Modulations of the same length only differ in what is read from accepted frames.
-    chips = {one: _codeword_chips(_change_link(link, {"modulation.id": one}, registry)) for one in others}
-    alike = [one for one in others if chips[one] == _codeword_chips(link)]
-    rest = [one for one in others if one not in alike]
+    alike = [name for name, words in others.items() if words.shape[-1] == chips]
+    rest = [name for name in others if name not in alike]
 
     for name, values, by_frames in (
         (_RATE, rates_hz, True),
@@ -173,6 +175,16 @@ def infer_links(link: Link, lights: Iterable[Events], registry: Registry) -> Ite
             yield Trial((), link, 0, 0, 0.0, 0, explanation)
 
 
+def find_other_codewords(link: Link, registry: Registry) -> dict[str, NDArray[np.uint8]]:
+    """Codewords of the other installed modulations, by id, uint8 (symbols, chips)."""
+    if "modulation" not in link.table:
+        return {}
+    names = [one.algorithm.id for one in registry.list_algorithms("modulation")]
+    names.remove(link.table["modulation"]["id"])
+    links = {name: _change_link(link, {"modulation.id": name}, registry) for name in names}
+    return {name: other.codebook.codewords for name, other in links.items() if other is not None}
+
+
 def _try_values(
     start: Trial, name: str, values: Iterable[Any], events: Events, registry: Registry
 ) -> Iterator[Trial]:
@@ -187,10 +199,6 @@ def _try_values(
             # Codes that the link's own steps cannot decode.
             continue
         yield trial
-
-
-def _codeword_chips(link: Link | None) -> int:
-    return link.codebook.codewords.shape[-1] if link is not None else 0
 
 
 def _list_frame_counts(frames: int) -> list[int]:

@@ -10,7 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from evlcp_sdk.diagnosis.facts import Facts, find_other_codewords
+from evlcp_sdk.diagnosis.facts import Facts
+from evlcp_sdk.diagnosis.probe import find_other_codewords
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.diagnosis.tallies import PositionTally, RunTally
 from evlcp_sdk.link.resolve import Link

@@ -10,7 +10,8 @@ from hypothesis import given, strategies as st
 from numpy.typing import NDArray
 
 from evlcp_sdk.diagnosis.checks import run_checks
-from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, find_other_codewords
+from evlcp_sdk.diagnosis.facts import Diagnostic, Facts
+from evlcp_sdk.diagnosis.probe import find_other_codewords
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.diagnosis.tallies import PositionTally, RunTally
 from evlcp_sdk.link.resolve import load_link
