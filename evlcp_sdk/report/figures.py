@@ -21,7 +21,6 @@ from evlcp_sdk.report.colours import cluster_colours, transmitter_colour
 from evlcp_sdk.report.drawing import INK_COLOUR, draw_plots, set_heading, style_axes
 from evlcp_sdk.report.recording import (
     ChartSink,
-    EvenSample,
     name_transmitter,
     plot_distances,
     plot_positions,
@@ -30,12 +29,13 @@ from evlcp_sdk.report.recording import (
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
+from evlcp_sdk.rx.boxes import Box, bounding_box, box_of
 from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 _DPI = 150
 _MAX_TRANSMITTERS = 3
-_MAX_BOXES, _MAX_REGIONS = 1024, 64
-"""Boxes of a region, and regions, that are kept."""
+_MAX_REGIONS = 64
+"""Regions that are kept."""
 
 
 class Figures(ChartSink):
@@ -45,14 +45,15 @@ class Figures(ChartSink):
 
     Attributes:
         image: Events of each pixel, int64 (rows, columns).
-        region_count: Number of all regions; `regions` has those with the most boxes.
+        regions: How often each region was seen, and the box that holds it all the time, px.
+        region_count: Number of all regions; `regions` has those that were seen most often.
         clearest: The frame of best quality of each transmitter, and its presence map.
     """
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
         self.image: NDArray[np.int64] = np.zeros((run.link.camera.height, run.link.camera.width), np.int64)
-        self.regions: dict[int, EvenSample[Region]] = {}
+        self.regions: dict[int, tuple[int, Box]] = {}
         self.region_count = 0
         self.clearest: dict[int, tuple[Frame, PresenceMap]] = {}
         self._presence: PresenceMap | None = None
@@ -83,9 +84,9 @@ class Figures(ChartSink):
         if region.id not in self.regions:
             self.region_count += 1
             if len(self.regions) == _MAX_REGIONS:
-                del self.regions[min(self.regions, key=lambda number: len(self.regions[number]))]
-            self.regions[region.id] = EvenSample(_MAX_BOXES)
-        self.regions[region.id].add(region)
+                del self.regions[min(self.regions, key=lambda number: self.regions[number][0])]
+        times, box = self.regions.get(region.id, (0, box_of(region)))
+        self.regions[region.id] = times + 1, bounding_box([box, box_of(region)])
 
     def finish(self) -> Mapping[str, Any]:
         """Draw the figures."""
@@ -122,11 +123,8 @@ def draw_regions(kept: Figures, title: str) -> Figure:
     if kept.region_count > len(kept.regions):
         text += f", {len(kept.regions)} shown"
     set_heading(axis, f"{title}: {kept.image.sum():,} events, {text}")
-    for index, (number, places) in enumerate(sorted(kept.regions.items())):
+    for index, (number, (_, (left, upper, right, lower))) in enumerate(sorted(kept.regions.items())):
         colour = transmitter_colour(index)
-        boxes = np.array([(one.x_px, one.y_px, one.width_px, one.height_px) for one in places])
-        corners = boxes[:, :2] - boxes[:, 2:] / 2
-        (left, upper), (right, lower) = corners.min(0), (corners + boxes[:, 2:]).max(0)
         box = right - left + 12, lower - upper + 12
         axis.add_patch(Rectangle((left - 6, upper - 6), *box, fill=False, ec=colour, lw=1.4))
         axis.annotate(

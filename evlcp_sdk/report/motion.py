@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import cluster_hex
 from evlcp_sdk.values import Frame, FrameView, PresenceMap
 
@@ -20,6 +19,12 @@ _MAX_CELLS = 250_000
 """Chips times pixels of a picture; in a larger one, pixels are binned."""
 
 _NO_CLUSTER = -1
+
+_CLEAR = 0.5
+"""Quality of a frame that is preferred to one below."""
+
+_LARGER_RATIO = 1.1
+"""Ratio of sizes from which a larger image is preferred."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +62,13 @@ class Motion:
         clipped = np.clip(sums, -_MAX_EVENTS, _MAX_EVENTS).astype(np.int8)
         return cls(frame, clipped, clusters.copy())
 
+    def shows_less_than(self, frame: Frame, view: FrameView) -> bool:
+        """Whether another frame of the transmitter is clearer, or as clear and larger in the image."""
+        own_quality, quality = self.frame.soft.quality, frame.soft.quality
+        area = int(view.presence.selected.any(0).sum()) * view.presence.grid_px**2
+        is_larger = area > _LARGER_RATIO * int(np.count_nonzero(self.clusters >= 0))
+        return own_quality < _CLEAR <= quality or (quality >= min(_CLEAR, own_quality) and is_larger)
+
     def to_dict(self, codebook: Codebook, chip_us: float, ms: Callable[[float], float]) -> dict[str, Any]:
         """The frame as JSON values for a page's script; `ms` converts camera time to the time shown."""
         chips, height, width = self.sums.shape
@@ -80,53 +92,6 @@ class Motion:
             "colours": cluster_hex(codebook.clusters),
             "upside": len(seen) > 1 and seen[0][1] > seen[-1][1],
         }
-
-
-class MotionCollector:
-    """Keeps the largest frame that is read of some transmitters; listens to the stages.
-
-    Args:
-        most: Number of transmitters, the first ones.
-    """
-
-    def __init__(self, most: int = 3) -> None:
-        self._most = most
-        self._view: FrameView | None = None
-        self._kept: dict[int, Motion] = {}
-
-    @hookimpl
-    def evlcp_stage_finished(self, stage: str, value: Any) -> None:
-        """Keep a frame that shows more than those before."""
-        if stage == "view":
-            self._view = value
-        elif stage == "frame":
-            view, self._view = self._view, None
-            # A frame without a pilot has no view, and looks as the one with its pilot.
-            if view is not None and view.soft.symbols.shape == value.soft.symbols.shape:
-                self._keep_clearest(value, view)
-
-    def _keep_clearest(self, frame: Frame, view: FrameView) -> None:
-        last, quality = self._kept.get(frame.transmitter), frame.soft.quality
-        if last is None:
-            is_better = len(self._kept) < self._most
-        else:
-            old = last.frame.soft.quality
-            area = int(view.presence.selected.any(0).sum()) * view.presence.grid_px**2
-            is_larger = area > _LARGER_RATIO * int(np.count_nonzero(last.clusters >= 0))
-            is_better = old < _CLEAR <= quality or (quality >= min(_CLEAR, old) and is_larger)
-        if is_better:
-            self._kept[frame.transmitter] = Motion.of(frame, view)
-
-    def motions(self) -> list[Motion]:
-        """The kept frames, by transmitter."""
-        return [self._kept[number] for number in sorted(self._kept)]
-
-
-_CLEAR = 0.5
-"""Quality of a frame that is preferred to one below."""
-
-_LARGER_RATIO = 1.1
-"""Ratio of sizes from which a larger image is preferred."""
 
 
 def cluster_map(presence: PresenceMap, size: tuple[int, ...]) -> NDArray[np.int16]:

@@ -15,7 +15,7 @@ from evlcp_sdk.diagnosis.facts import Diagnostic
 from evlcp_sdk.formatting import format_count
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import transmitter_colour
-from evlcp_sdk.report.motion import MotionCollector
+from evlcp_sdk.report.motion import Motion
 from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.report.plots import SCRIPT, Plot, render_plot
 from evlcp_sdk.report.recording import (
@@ -30,10 +30,12 @@ from evlcp_sdk.report.recording import (
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
-from evlcp_sdk.values import Frame, Packet, ReceivedMessage
+from evlcp_sdk.values import Frame, FrameView, Packet, ReceivedMessage
 
 _MAX_MESSAGES = 50
 _MAX_TEXT = 2_000
+_MAX_MOTIONS = 3
+"""Transmitters of a link with a frame in slow motion."""
 
 _LONG_S = 5.0
 """Duration of a recording from which on its charts are in seconds."""
@@ -44,15 +46,28 @@ class Report(ChartSink):
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
-        self._motion = MotionCollector(3 * max(len(run.links), 1))
+        self._view: FrameView | None = None
+        self._motions: dict[int, Motion] = {}
         self._messages: list[ReceivedMessage] = []
         self._latest: deque[ReceivedMessage] = deque(maxlen=_MAX_MESSAGES)
         self._message_count = 0
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
-        """Keep frames in slow motion."""
-        self._motion.evlcp_stage_finished(stage, value)
+        """Keep of the first transmitters the frame that shows most."""
+        if stage == "view":
+            self._view = value
+        elif stage == "frame":
+            view, self._view = self._view, None
+            # A frame without a pilot has no view, and looks as the one with its pilot.
+            if view is not None and view.soft.symbols.shape == value.soft.symbols.shape:
+                self._keep_motion(value, view)
+
+    def _keep_motion(self, frame: Frame, view: FrameView) -> None:
+        last = self._motions.get(frame.transmitter)
+        has_room = len(self._motions) < _MAX_MOTIONS * max(len(self.run.links), 1)
+        if has_room if last is None else last.shows_less_than(frame, view):
+            self._motions[frame.transmitter] = Motion.of(frame, view)
 
     def packet(self, packet: Packet) -> None:
         """Keep frames and messages."""
@@ -68,9 +83,9 @@ class Report(ChartSink):
             axis = seconds_axis(axis.zero_us)
         motions = [
             motion.to_dict(link.codebook, link.packet.chip_us, axis.ms)
-            for motion in self._motion.motions()
+            for number, motion in sorted(self._motions.items())
             # Transmitters that another link fitted better are not given.
-            if motion.frame.transmitter in self.transmitters or not self.run.links
+            if number in self.transmitters or not self.run.links
             for link in [self.run.link_of(motion.frame.link)]
         ]
         frames = self.frames()
