@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from evlcp_sdk.results.picture import EventImage
+from evlcp_sdk.results.picture import paint_events
 from evlcp_sdk.values import Events, Region
 
 WINDOW_US = 10_000
@@ -31,15 +32,15 @@ class Picture:
     regions: tuple[Region, ...]
     number: int
 
-    def to_image(self) -> EventImage:
-        """Paint the events, in the caller's thread rather than the receiver's."""
-        image = EventImage(self.width, self.height)
+    def paint(self) -> NDArray[np.uint8]:
+        """The polarities that each pixel showed, by the caller's thread rather than the receiver's."""
+        cells = np.zeros((self.height, self.width), np.uint8)
         # Every piece has events of the window.
         oldest = self.pieces[0]
         first = int(np.searchsorted(oldest.t_us, self.t_us - WINDOW_US, "right"))
         for piece in (oldest[first:], *self.pieces[1:]):
-            image.paint(piece)
-        return image
+            paint_events(cells, piece)
+        return cells
 
 
 class PictureSlot:

@@ -15,6 +15,7 @@ from evlcp_sdk.live.publisher import News
 from evlcp_sdk.results.columns import frame_columns
 from evlcp_sdk.results.lines import fix_line, format_frame
 from evlcp_sdk.results.packets_jsonl import message_line
+from evlcp_sdk.results.picture import encode_png
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Frame, ReceivedMessage
 
@@ -54,7 +55,7 @@ class Serializer:
         """
         if self._last_picture[0] != picture.number:
             latest = [one for one in self._bars.values() if one.t_us > picture.t_us - _BAR_MEMORY_US]
-            self._last_picture = picture.number, _picture_json(picture, latest), picture.to_image().to_png()
+            self._last_picture = picture.number, _picture_json(picture, latest), encode_png(picture.paint())
         return self._last_picture[1:]
 
     def _keep_frame(self, frame: Frame) -> None:

@@ -12,6 +12,7 @@ from evlcp_sdk.live.pictures import PictureSlot
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.pose import solve_pose
+from evlcp_sdk.results.picture import encode_png
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.workers import has_bar_frames, load_decoder_kernels
 from evlcp_sdk.scene.attitude import Attitude
@@ -41,7 +42,7 @@ def load_kernels(links: Sequence[Link], *, positions: bool = False) -> None:
             pictures.request()
             pictures.add(events, camera.width, camera.height, receiver.regions)
             if pictures.newest is not None:
-                pictures.newest.to_image().to_png()
+                encode_png(pictures.newest.paint())
             receiver.feed(events)
             if int(events.t_us[0]) > first_us + _LENGTH_US:
                 break

@@ -15,7 +15,7 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.lines import format_frame, integrity_fields
-from evlcp_sdk.results.picture import EventImage
+from evlcp_sdk.results.picture import encode_png, paint_events
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite
@@ -50,7 +50,7 @@ class Mcap(Sink):
         self._writer.start(library="evlcp-sdk")
         self._channels: dict[str, int] = {}
         camera = run.link.camera
-        self._image = EventImage(camera.width, camera.height)
+        self._cells = np.zeros((camera.height, camera.width), np.uint8)
         self._picture: int | None = None
         self._turn: int | None = None
         self._regions: dict[int, Region] = {}
@@ -67,7 +67,7 @@ class Mcap(Sink):
             if self._picture != number[first]:
                 self._write_picture()
                 self._picture = int(number[first])
-            self._image.paint(events[first:last])
+            paint_events(self._cells, events[first:last])
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
@@ -142,10 +142,12 @@ class Mcap(Sink):
         if self._picture is None:
             return
         end_us = (self._picture + 1) * _PICTURE_US
-        image = _load_schema("CompressedImage")(frame_id=CAMERA_ID, data=self._image.to_png(), format="png")
+        image = _load_schema("CompressedImage")(
+            frame_id=CAMERA_ID, data=encode_png(self._cells), format="png"
+        )
         image.timestamp.FromNanoseconds(self._to_ns(end_us))
         self._write_message("/image", end_us, image)
-        self._image.clear()
+        self._cells[:] = 0
         self._picture = None
 
     def _write_regions(self) -> None:
