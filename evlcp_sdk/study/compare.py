@@ -23,7 +23,7 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim.truth import Truth, read_truth, truth_path
 from evlcp_sdk.stopwatch import Stopwatch
 from evlcp_sdk.study.bound import frame_bound
-from evlcp_sdk.study.comparison import STAGES, Comparison, Measurement, ProcessingTime, Table, total_of
+from evlcp_sdk.study.comparison import STAGES, Comparison, Measurement, Table, total_of
 from evlcp_sdk.study.frames import FrameRow, frames_of
 from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.measure import count_without_truth, statistics_of
@@ -111,8 +111,7 @@ class _StageTimer:
     """
 
     def __init__(self) -> None:
-        self.stage_us: dict[str, list[float]] = {stage: [] for stage in STAGES}
-        self.frame_us: list[float] = []
+        self.frames_us: list[dict[str, float]] = []
         self.views: list[FrameView] = []
         self._frame: dict[str, float] = {}
         self._finished_s = time.thread_time()
@@ -123,9 +122,7 @@ class _StageTimer:
         if stage in STAGES:
             self._frame[stage] = spent_s * 1e6
         elif stage == "frame":
-            for name, us in self._frame.items():
-                self.stage_us[name].append(us)
-            self.frame_us.append(sum(self._frame.values()))
+            self.frames_us.append(self._frame)
             self._frame = {}
         elif stage == "view":
             self.views.append(value)
@@ -150,17 +147,13 @@ class _VariantRun:
 
     def measure(self, name: str, truth: Truth | None, recorded_s: float, reading_s: float) -> Measurement:
         """Counts and times of its run on a recording, with the truth if it is known."""
-        times = ProcessingTime(
-            frame_us=tuple(self.timer.frame_us),
-            stage_us={stage: tuple(us) for stage, us in self.timer.stage_us.items()},
-            recorded_s=recorded_s,
-            cpu_s=reading_s + self.spent.processor_s,
-        )
         if truth is None:
-            return Measurement({name: count_without_truth(self.frames, self.packets)}, times)
-        several = self.links if len(self.links) > 1 else None
-        counted = statistics_of(self.frames, truth, packets=self.packets, links=several)
-        return Measurement({name: counted}, times)
+            counted = count_without_truth(self.frames, self.packets)
+        else:
+            several = self.links if len(self.links) > 1 else None
+            counted = statistics_of(self.frames, truth, packets=self.packets, links=several)
+        cpu_s = reading_s + self.spent.processor_s
+        return Measurement({name: counted}, tuple(self.timer.frames_us), recorded_s, cpu_s)
 
 
 def compare_recording(

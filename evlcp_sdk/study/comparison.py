@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from markupsafe import Markup
@@ -25,47 +25,32 @@ STAGES = ("separation", "decoding", "ranging")
 
 
 @dataclass(frozen=True)
-class ProcessingTime:
-    """Time that one variant took; adds over recordings.
-
-    Attributes:
-        frame_us: Time of every frame in the stages `STAGES` together, us; of each stage: `stage_us`.
-        recorded_s: Duration of the recordings, s.
-        cpu_s: Processor time for reading and receiving them, as of `Stopwatch`, s.
-    """
-
-    frame_us: tuple[float, ...] = ()
-    stage_us: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: dict.fromkeys(STAGES, ()))
-    recorded_s: float = 0.0
-    cpu_s: float = 0.0
-
-    def __add__(self, other: "ProcessingTime") -> "ProcessingTime":
-        return ProcessingTime(
-            self.frame_us + other.frame_us,
-            {stage: self.stage_us[stage] + other.stage_us[stage] for stage in STAGES},
-            self.recorded_s + other.recorded_s,
-            self.cpu_s + other.cpu_s,
-        )
-
-
-@dataclass(frozen=True)
 class Measurement:
     """Counts and times of one variant; adds over recordings.
 
     Attributes:
         recordings: Counts by the name of what is independent: a recording, or all of a campaign's with one
             seed. Without truth, only rows and packets.
-        times: What it took; empty where it was not measured.
+        frames_us: Time of every frame in each of the stages `STAGES` that it went through, us.
+        recorded_s: Duration of the recordings whose time was measured, s.
+        cpu_s: Processor time for reading and receiving them, as of `Stopwatch`, s.
     """
 
     recordings: Mapping[str, Statistics] = field(default_factory=dict)
-    times: ProcessingTime = field(default_factory=ProcessingTime)
+    frames_us: tuple[Mapping[str, float], ...] = ()
+    recorded_s: float = 0.0
+    cpu_s: float = 0.0
 
     def __add__(self, other: "Measurement") -> "Measurement":
         recordings = dict(self.recordings)
         for name, one in other.recordings.items():
             recordings[name] = recordings.get(name, Statistics()) + one
-        return Measurement(recordings, self.times + other.times)
+        return Measurement(
+            recordings,
+            self.frames_us + other.frames_us,
+            self.recorded_s + other.recorded_s,
+            self.cpu_s + other.cpu_s,
+        )
 
     @cached_property
     def statistics(self) -> Statistics:
@@ -82,15 +67,41 @@ class Measurement:
         """The bit error rate with its interval over recordings."""
         return measure_figure([one.total() for one in self.recordings.values()], "ber")
 
-    @property
-    def us_per_frame(self) -> float:
-        """Median time of a frame, us, which other work of the machine hardly changes."""
-        return median(self.times.frame_us)
-
-    @property
-    def times_real_time(self) -> float:
-        """Recorded time over the processor time of reading and receiving."""
-        return times_real_time(self.times.recorded_s, self.times.cpu_s)
+    @cached_property
+    def figures(self) -> dict[str, Any]:
+        """Every figure by its name in JSON and CSV; NaN or None where it was not measured."""
+        tally, truth = self.tally, self.tally.frames_sent > 0
+        has_interval = _interval_cell(self) != "-"
+        return {
+            "frames": self.statistics.rows,
+            "frames_sent": tally.frames_sent if truth else None,
+            "frames_found": tally.frames_found if truth else None,
+            "found_share": tally.found_share,
+            "unmatched": self.statistics.unmatched if truth else None,
+            "echoes": self.statistics.echoes,
+            "packets": self.statistics.packets,
+            "bits": tally.bits,
+            "bit_errors": tally.bit_errors if tally.bits else None,
+            "ber": tally.ber,
+            "ber_low": self.ber.low if has_interval else None,
+            "ber_high": self.ber.high if has_interval else None,
+            "erased_share": tally.erased_share,
+            "claimed_share": tally.claimed_share,
+            "ranged": tally.ranged,
+            "rmse_m": tally.rmse_m,
+            "bias_m": tally.bias_m,
+            "nees": tally.nees,
+            "gross": tally.gross if tally.ranged else None,
+            "gross_share": tally.gross_share,
+            "filtered_rmse_m": tally.filtered_rmse_m,
+            "sigma_m": self.statistics.sigma_m,
+            # Other work of the machine hardly changes a median.
+            "us_per_frame": median([sum(frame.values()) for frame in self.frames_us]),
+            **{f"{s}_us": median([frame[s] for frame in self.frames_us if s in frame]) for s in STAGES},
+            "recorded_s": self.recorded_s,
+            "cpu_s": self.cpu_s or None,
+            "times_real_time": times_real_time(self.recorded_s, self.cpu_s),
+        }
 
 
 def median(values: Sequence[float]) -> float:
@@ -128,14 +139,26 @@ class Column:
     Attributes:
         key: Name of the figure, as in JSON and CSV.
         title: Heading.
-        cell: Formats the figure; `-` where it was not measured.
-        rank: The smallest is the best; None for a column without a best.
+        form: Format of the figure, or what formats it.
+        best: The smallest size of the figure is the best, or the largest; None for a column without a best.
     """
 
     key: str
     title: str
-    cell: Callable[[Measurement], str]
-    rank: Callable[[Measurement], float] | None
+    form: str | Callable[[Measurement], str]
+    best: Literal["least", "most"] | None = None
+
+    def cell(self, measured: Measurement) -> str:
+        """The text of a row; `-` where nothing was measured."""
+        if callable(self.form):
+            return self.form(measured)
+        return format_number(measured.figures[self.key], self.form)
+
+    def rank(self, measured: Measurement) -> float:
+        """Rank of a row: the smallest is the best, NaN is not."""
+        size = float(abs(measured.figures[self.key]))
+        # A variant that finds none is not the best.
+        return size if self.best == "least" else -size or math.nan
 
 
 def _frames_cell(m: Measurement) -> str:
@@ -144,7 +167,7 @@ def _frames_cell(m: Measurement) -> str:
 
 
 def _ber_cell(m: Measurement) -> str:
-    return format_number(m.tally.ber, ".1e") if m.tally.bit_errors else "-" if not m.tally.bits else "0"
+    return "0" if m.ber.is_zero else format_number(m.ber.value, ".1e")
 
 
 def _interval_cell(m: Measurement) -> str:
@@ -154,43 +177,25 @@ def _interval_cell(m: Measurement) -> str:
     return ber.interval(".1e") if ber.recordings >= FEWEST_RECORDINGS else "-"
 
 
-def _share_cell(count: int, of: int) -> str:
-    return f"{count / of:.1%}" if count else "-"
-
-
-def _gross_cell(m: Measurement) -> str:
-    return f"{m.tally.gross_share:.1%} ({m.tally.gross})" if m.tally.ranged else "-"
-
-
 COLUMNS = (
-    # A variant that finds none is not the best.
-    Column("found_share", "frames", _frames_cell, lambda m: -m.tally.found_share or math.nan),
-    Column("packets", "packets", lambda m: str(m.statistics.packets), None),
-    Column("ber", "BER", _ber_cell, lambda m: m.tally.ber),
-    Column("ber_interval", "95 %", _interval_cell, None),
-    Column("erased_share", "erased", lambda m: _share_cell(m.tally.erased, m.tally.visible), None),
-    Column("claimed_share", "claimed", lambda m: _share_cell(m.tally.claimed, m.tally.hidden), None),
-    Column("rmse_m", "RMSE, m", lambda m: format_number(m.tally.rmse_m, ".4f"), lambda m: m.tally.rmse_m),
+    Column("found_share", "frames", _frames_cell, "most"),
+    Column("packets", "packets", "d"),
+    Column("ber", "BER", _ber_cell, "least"),
+    Column("ber_interval", "95 %", _interval_cell),
+    Column("erased_share", "erased", lambda m: f"{m.tally.erased_share:.1%}" if m.tally.erased else "-"),
+    Column("claimed_share", "claimed", lambda m: f"{m.tally.claimed_share:.1%}" if m.tally.claimed else "-"),
+    Column("rmse_m", "RMSE, m", ".4f", "least"),
+    Column("bias_m", "bias, m", "+.4f", "least"),
     Column(
-        "bias_m", "bias, m", lambda m: format_number(m.tally.bias_m, "+.4f"), lambda m: abs(m.tally.bias_m)
+        "gross_share",
+        ">= 0.5 m",
+        lambda m: f"{m.tally.gross_share:.1%} ({m.tally.gross})" if m.tally.ranged else "-",
+        "least",
     ),
-    Column("gross_share", ">= 0.5 m", _gross_cell, lambda m: m.tally.gross_share),
-    Column(
-        "filtered_rmse_m",
-        "filtered, m",
-        lambda m: format_number(m.tally.filtered_rmse_m, ".4f"),
-        lambda m: m.tally.filtered_rmse_m,
-    ),
-    Column("sigma_m", "sigma, m", lambda m: format_number(m.statistics.sigma_m, ".4f"), None),
-    Column(
-        "us_per_frame", "us/frame", lambda m: format_number(m.us_per_frame, ".0f"), lambda m: m.us_per_frame
-    ),
-    Column(
-        "times_real_time",
-        "x real time",
-        lambda m: format_number(m.times_real_time, ".2f"),
-        lambda m: -m.times_real_time,
-    ),
+    Column("filtered_rmse_m", "filtered, m", ".4f", "least"),
+    Column("sigma_m", "sigma, m", ".4f"),
+    Column("us_per_frame", "us/frame", ".0f", "least"),
+    Column("times_real_time", "x real time", ".2f", "most"),
 )
 """The columns, in order."""
 
@@ -214,7 +219,7 @@ class Table:
         """
         best_keys: list[set[str]] = [set() for _ in self.rows]
         for column in COLUMNS:
-            if column.rank is None:
+            if column.best is None:
                 continue
             ranks = [column.rank(measured) for measured in self.rows.values()]
             finite = [rank for rank in ranks if not math.isnan(rank)]
@@ -250,38 +255,10 @@ class Table:
         """Every figure of each row as plain values; None where it was not measured."""
         records = []
         for (name, m), keys in zip(self.rows.items(), self.find_best(), strict=True):
-            tally, truth = m.tally, m.tally.frames_sent > 0
-            low, high = (m.ber.low, m.ber.high) if _interval_cell(m) != "-" else (math.nan, math.nan)
             values: dict[str, Any] = {
                 "recording": self.name,
                 "variant": name,
-                "frames": m.statistics.rows,
-                "frames_sent": tally.frames_sent if truth else None,
-                "frames_found": tally.frames_found if truth else None,
-                "found_share": tally.found_share,
-                "unmatched": m.statistics.unmatched if truth else None,
-                "echoes": m.statistics.echoes,
-                "packets": m.statistics.packets,
-                "bits": tally.bits,
-                "bit_errors": tally.bit_errors if tally.bits else None,
-                "ber": tally.ber,
-                "ber_low": low,
-                "ber_high": high,
-                "erased_share": tally.erased_share,
-                "claimed_share": tally.claimed_share,
-                "ranged": tally.ranged,
-                "rmse_m": tally.rmse_m,
-                "bias_m": tally.bias_m,
-                "nees": tally.nees,
-                "gross": tally.gross if tally.ranged else None,
-                "gross_share": tally.gross_share,
-                "filtered_rmse_m": tally.filtered_rmse_m,
-                "sigma_m": m.statistics.sigma_m,
-                "us_per_frame": m.us_per_frame,
-                **{f"{stage}_us": median(m.times.stage_us[stage]) for stage in STAGES},
-                "recorded_s": m.times.recorded_s,
-                "cpu_s": m.times.cpu_s or None,
-                "times_real_time": m.times_real_time,
+                **m.figures,
                 "cramer_rao_bound_m": rms(self.bounds_m),
                 "best": sorted(keys),
             }

@@ -20,7 +20,6 @@ from evlcp_sdk.study.comparison import (
     STAGES,
     Comparison,
     Measurement,
-    ProcessingTime,
     Table,
     compare_links,
     total_of,
@@ -46,14 +45,15 @@ def make_measured(error=ERRORS, filtered=FILTERED, times=None, **changes: int) -
     """A variant with truth and a tracking filter."""
     tally = Tally(**({"frames_sent": 100, "frames_found": 88, "bits": 8448, "bit_errors": 3} | changes))
     counts = {"packets": 9, "rows": 90, "unmatched": 2, "stated": 2, "sigma_squares_nm2": 10**17}
-    took = {"frame_us": (500.0, 700.0, 9000.0), "recorded_s": 0.4, "cpu_s": 0.2}
-    took |= {"stage_us": dict.fromkeys(STAGES, (100.0, 200.0, 300.0))}
+    frames = ((100, 150, 250), (200, 200, 300), (9000, 0, 0))
+    took = {"frames_us": tuple(dict(zip(STAGES, us, strict=True)) for us in frames)}
+    took |= {"recorded_s": 0.4, "cpu_s": 0.2}
     counted = Statistics.of([(30, tally), (40, error), (40, filtered)], **counts)
-    return Measurement({"REC.raw": counted}, ProcessingTime(**(took | (times or {}))))
+    return Measurement({"REC.raw": counted}, **(took | (times or {})))
 
 
 UNKNOWN = Statistics(rows=5, packets=1, stated=1, sigma_squares_nm2=4 * 10**16)
-BLIND = Measurement({"BLIND.raw": UNKNOWN}, ProcessingTime(recorded_s=0.1, cpu_s=0.1))
+BLIND = Measurement({"BLIND.raw": UNKNOWN}, recorded_s=0.1, cpu_s=0.1)
 """A variant on a recording without truth."""
 
 
@@ -72,19 +72,20 @@ def test_figures_by_hand() -> None:
     assert (m.ber.value, m.ber.recordings) == (3 / 8448, 1)
     assert math.isnan(m.ber.high)
     assert m.tally.rmse_m == pytest.approx(math.sqrt((0.01 + 0.04 + 0.36) / 3))
-    assert (m.us_per_frame, m.times_real_time, m.tally.found_share) == (700, 2, 0.88)
+    assert [m.figures[name] for name in ("us_per_frame", "times_real_time", "found_share")] == [700, 2, 0.88]
+    assert [m.figures[f"{stage}_us"] for stage in STAGES] == [200, 150, 250]
     both = m + make_measured(bit_errors=5)
     assert (both.tally.bits, both.tally.bit_errors) == (16896, 8)
     assert (both.statistics.packets, both.statistics.rows) == (18, 180)
-    assert both.times.frame_us == m.times.frame_us * 2
-    assert both.times.stage_us["ranging"] == m.times.stage_us["ranging"] * 2
+    assert both.frames_us == m.frames_us * 2
     for column in COLUMNS:
         assert column.cell(Measurement()) in ("-", "0")
-        assert column.rank is None or math.isnan(column.rank(Measurement()))
+        assert column.best is None or math.isnan(column.rank(Measurement()))
 
 
 def test_the_best_are_marked() -> None:
-    other = make_measured(errors(-0.2, 0.15, 0.7), times={"frame_us": (800.0,), "cpu_s": 0.1}, bit_errors=2)
+    times = {"frames_us": ({"ranging": 800.0},), "cpu_s": 0.1}
+    other = make_measured(errors(-0.2, 0.15, 0.7), times=times, bit_errors=2)
     best = table(make_measured(errors(0.5, -0.6, 0.0)), other).find_best()
     # As many frames: both. BER by its value: the intervals of 2 and 3 errors overlap.
     shared = {"found_share", "filtered_rmse_m"}
