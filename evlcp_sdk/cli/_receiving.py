@@ -15,7 +15,6 @@ from evlcp_sdk.cli._stderr import print_stderr
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.place.navigator import PositionPlan
-    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.utc import PulseClock
 
@@ -40,11 +39,11 @@ class LinkOptions:
     link_files: LinkFiles = None
     overrides: Overrides = None
 
-    def load(self, registry: "Registry") -> "tuple[Link, ...]":
+    def load(self) -> "tuple[Link, ...]":
         """Load the links; warn on stderr of those that a receiver cannot distinguish."""
         from evlcp_sdk.link.several import load_links, name_links
 
-        links = load_links(self.link_files, self.overrides or [], registry)
+        links = load_links(self.link_files, self.overrides or [])
         if len(links) > 1:
             from evlcp_sdk.diagnosis.light_checks import find_alike_links
 
@@ -96,14 +95,15 @@ class ResultOptions:
                 raise typer.BadParameter(reason, param_hint="--json-lines")
         return LinePrinter()
 
-    def load_sink_names(self, registry: "Registry", *, positions: bool) -> tuple[str, ...]:
+    def load_sink_names(self, *, positions: bool) -> tuple[str, ...]:
         """Names of the sinks in use, those with options of their own first, after a check that all load."""
         from evlcp_sdk.plugin.records import choose_sinks
+        from evlcp_sdk.plugin.registry import Registry
         from evlcp_sdk.results.sinks import load_sinks
 
         own_options = [name for name in ("figures", "report", "parquet", "mcap") if getattr(self, name)]
         names = tuple(dict.fromkeys([*own_options, *(self.sinks or [])]))
-        load_sinks(choose_sinks(registry, names, positions=positions))
+        load_sinks(choose_sinks(Registry.load(), names, positions=positions))
         if names and self.out is None:
             raise typer.BadParameter(
                 f"{', '.join(names)} goes into a folder: give -o OUT", param_hint="--out"

@@ -45,16 +45,12 @@ def calibrate(
     from evlcp_sdk import surveying
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.place.calibration import read_poses
-    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.sites import load_sites
 
-    registry = Registry.load()
-    link = load_link(link_file, overrides or [], registry)
+    link = load_link(link_file, overrides or [])
     bars = load_sites(sites)
     known = read_poses(poses)
-    result = surveying.calibrate(
-        recordings, bars, known, link, registry=registry, limit_px=limit_px, name=str(poses)
-    )
+    result = surveying.calibrate(recordings, bars, known, link, limit_px=limit_px, name=str(poses))
     if as_json:
         print_json(
             {

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFile, console, print_json
+from evlcp_sdk.errors import ConfigError
 
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
@@ -58,8 +59,6 @@ def check(
     One line per law: ok, failed (what was expected), skipped (why it does not apply), excused (by you).
     An excused law that holds is a failure. Exit code 0: no failure, 1: a law is broken.
     """
-    from evlcp_sdk.errors import ConfigError
-
     if role is None:
         if excuses:
             raise ConfigError("--excuse: expected ROLE and ID, whose law it is")
@@ -108,7 +107,6 @@ def _check_algorithm(
     as_json: bool,
 ) -> tuple[str, dict[str, Any]]:
     """Check an algorithm against the laws of its role; return its name and the JSON table."""
-    from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.testing import check as hold, laws_of
 
@@ -145,7 +143,6 @@ def _describe_outcome(outcome: Verdict) -> dict[str, str]:
 def _build_link(
     role: str, id: str, link_file: str | None, overrides: Sequence[str], registry: Registry
 ) -> Link:
-    from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.link.resolve import load_link, resolve
     from evlcp_sdk.plugin.roles import STEPS
     from evlcp_sdk.specs import parse_value

@@ -36,12 +36,10 @@ def diagnose(
     from evlcp_sdk.diagnosis.diagnose import diagnose as run
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.resolve import load_link
-    from evlcp_sdk.plugin.registry import Registry
 
-    registry = Registry.load()
-    link = load_link(link_file, overrides or [], registry)
+    link = load_link(link_file, overrides or [])
     with bytes_bar(Path(recording).name) as advance:
-        diagnosis = run(recording, link, registry=registry, advance=advance)
+        diagnosis = run(recording, link, advance=advance)
     if out is not None:
         from evlcp_sdk.report.diagnosis_page import render_diagnosis
 

@@ -16,6 +16,8 @@ from evlcp_sdk.cli._common import console
 from evlcp_sdk.cli._receiving import CameraOptions, Cores, LinkOptions, PlaceOptions, ResultOptions
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.cli._summary import format_delays, print_end
+from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
+from evlcp_sdk.signals import stop_on_request
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -25,9 +27,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.live.services import ServiceOptions
     from evlcp_sdk.place.navigator import PositionPlan
-    from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.plugin.source import EventSource
-    from evlcp_sdk.signals import Stopped
     from evlcp_sdk.utc import ClockZero
 
 _HERE = "127.0.0.1"
@@ -126,19 +125,18 @@ def live(
 
     What comes too fast is left out, and counted. Ctrl-C ends it.
     """
+    from evlcp_sdk.io.open import open_source
+    from evlcp_sdk.io.reconnect import ReconnectingSource
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.publisher import Publisher
-    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import live as run_live
-    from evlcp_sdk.signals import stop_on_request
 
     out, lines = result.out, result.make_line_printer([url])
-    registry = Registry.load()
-    links = link.load(registry)
+    links = link.load()
     plan = place.plan(links, mcap=result.mcap)
     clock = camera.clock(place)
     services = serving.to_options(out, positions=plan is not None)
-    sinks = result.load_sink_names(registry, positions=plan is not None)
+    sinks = result.load_sink_names(positions=plan is not None)
     attitude, publisher = camera.attitude(place), Publisher()
     with (
         stop_on_request() as stopped,
@@ -146,10 +144,9 @@ def live(
         _show_status(publisher, silent=lines is not None),
     ):
         summary = run_live(
-            _open_reconnecting(url, registry, stopped) if reconnect else url,
+            ReconnectingSource(partial(open_source, url), stopped) if reconnect else url,
             out,
             links,
-            registry=registry,
             plan=plan,
             attitude=attitude,
             clock_zero=clock,
@@ -185,17 +182,8 @@ def _serve(
         yield
 
 
-def _open_reconnecting(url: str, registry: Registry, stopped: Stopped) -> EventSource:
-    from evlcp_sdk.io.open import open_source
-    from evlcp_sdk.io.reconnect import ReconnectingSource
-
-    return ReconnectingSource(partial(open_source, url, registry), stopped)
-
-
 def _exit_code(summary: dict[str, Any], interrupted: Path | None) -> int:
     """The exit code of a run; raises where it was interrupted."""
-    from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
-
     if interrupted is not None:
         raise InterruptedRunError(f"interrupted; what was decoded until then is in {interrupted}")
     if summary["status"] != "failed":

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -24,13 +25,12 @@ from evlcp_sdk.cli._receiving import (
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.cli._summary import print_end
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
+from evlcp_sdk.signals import EndRequest, stop_on_request
 
 if TYPE_CHECKING:
     from datetime import datetime
 
     from evlcp_sdk.link.resolve import Link
-    from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.signals import EndRequest
     from evlcp_sdk.study.jobs import Executor, Outcome
     from evlcp_sdk.utc import PulseClock
 
@@ -83,31 +83,30 @@ def receive(
     OUT gets frames.csv (a row a frame), packets.jsonl (a line a packet or message) and summary.json; with
     --sites fixes.csv, track.csv, fixes.geojson and fixes.nmea, too. An earlier result there is replaced.
     """
-    from evlcp_sdk.plugin.registry import Registry
-
     lines = result.make_line_printer(recordings)
     jobs = _make_jobs(recordings, result.out, lines)
-    registry = Registry.load()
-    links = link.load(registry)
+    links = link.load()
     if link_mode == "auto":
         if len(links) > 1:
             raise typer.BadParameter("varies one link: give one -c, or none", param_hint="--link")
-        jobs = [_infer_job_link(job, links[0], registry) for job in jobs]
+        jobs = [_infer_job_link(job, links[0]) for job in jobs]
     plan = place.plan(links, mcap=result.mcap)
-    sinks = result.load_sink_names(registry, positions=plan is not None)
-    options: dict[str, Any] = {
-        "links": links,
-        "plan": plan,
-        "attitude": camera.attitude(place),
-        "sinks": sinks,
-    }
-    options["workers"] = cores
-    decode = partial(_decode, clock=partial(camera.clock, place), lines=lines, **options)
+    sinks = result.load_sink_names(positions=plan is not None)
+    decode = partial(
+        _decode,
+        links=links,
+        clock=partial(camera.clock, place),
+        lines=lines,
+        plan=plan,
+        attitude=camera.attitude(place),
+        sinks=sinks,
+        workers=cores,
+    )
     in_process = dask is None and (not workers or len(jobs) == 1)
     if lines is not None and not in_process:
         raise typer.BadParameter("are given by this process only", param_hint="--json-lines")
     executor = make_executor(0 if in_process else workers or None, dask)
-    outcomes = _run_jobs(jobs, decode, executor, registry if in_process else None, result, lines)
+    outcomes = _run_jobs(jobs, decode, executor, result, lines, in_process=in_process)
     raise typer.Exit(_exit_code(outcomes, strict=strict) or int(lines is not None and lines.failed))
 
 
@@ -115,26 +114,28 @@ def _run_jobs(
     jobs: Sequence[ReceiveJob],
     decode: Callable[..., dict[str, Any]],
     executor: Executor,
-    registry: Registry | None,
     result: ResultOptions,
     lines: LinePrinter | None,
+    *,
+    in_process: bool,
 ) -> list[Outcome[ReceiveJob, dict[str, Any]]]:
-    """Decode all, here if a registry is given, else in workers; print how each ended.
+    """Decode all, in this process or in workers; print how each ended.
 
     Raises:
         InterruptedRunError: The user has ended it.
     """
-    from evlcp_sdk.signals import stop_on_request
     from evlcp_sdk.study.jobs import stop_workers
 
     outcomes: list[Outcome[ReceiveJob, dict[str, Any]]] = []
     with (
         stop_on_request(stop_workers) as stopped,
-        progress_bar("recordings") if registry is None else nullcontext() as advance,
+        # In this process, each recording has a bar of its own.
+        nullcontext() if in_process else progress_bar("recordings") as advance,
         ExitStack() as stack,
     ):
-        run = partial(decode, in_process=None if registry is None else (registry, stopped))
-        for outcome in stack.enter_context(closing(executor.run(run, _take_until_stopped(stopped, jobs)))):
+        run = partial(decode, stopped=stopped if in_process else None)
+        due = takewhile(lambda _: not stopped(), jobs)
+        for outcome in stack.enter_context(closing(executor.run(run, due))):
             outcomes.append(outcome)
             if advance is not None:
                 advance(len(outcomes), len(jobs))
@@ -168,7 +169,7 @@ def _exit_code(outcomes: Sequence[Outcome[ReceiveJob, dict[str, Any]]], *, stric
     return max(failures, default=0) or DEGRADED * ("degraded" in statuses) or int(strict and has_warnings)
 
 
-def _infer_job_link(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:
+def _infer_job_link(job: ReceiveJob, link: Link) -> ReceiveJob:
     """Give a job the link that fits its recording best, and print it."""
     from evlcp_sdk.diagnosis.diagnose import infer_link
     from evlcp_sdk.io.open import STDIN, open_source
@@ -177,8 +178,8 @@ def _infer_job_link(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJ
         raise typer.BadParameter(
             "standard input is read once, and links are tried on it first", param_hint="--link"
         )
-    with open_source(job.url, registry) as source:
-        trials = infer_link(source, link, registry)
+    with open_source(job.url) as source:
+        trials = infer_link(source, link)
     best = trials[0]
     name, due = Path(job.url).name, best.frames + best.rejected
     for explanation in dict.fromkeys(one.explanation for one in trials if one.explanation):
@@ -195,33 +196,24 @@ def _infer_job_link(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJ
 def _decode(
     job: ReceiveJob,
     *,
-    in_process: tuple[Registry, EndRequest] | None,
+    stopped: EndRequest | None,
     links: tuple[Link, ...],
     clock: Callable[[], datetime | PulseClock | None],
     lines: LinePrinter | None,
     **options: Any,
 ) -> dict[str, Any]:
-    """Decode a recording here, with a bar, or quietly in a worker; return its summary."""
+    """Decode a recording with a bar until `stopped`, or quietly in a worker; return its summary."""
     from evlcp_sdk.run import receive_to_folder
-    from evlcp_sdk.signals import stop_on_request
 
     run = partial(receive_to_folder, job.url, job.folder, job.link or links, clock_zero=clock(), **options)
-    if in_process is not None:
-        registry, stopped = in_process
+    if stopped is not None:
         stop = stopped.or_when(lambda: job.folder is None and lines is not None and lines.closed)
         with bytes_bar(_source_name(job.url)) as advance:
-            return run(registry=registry, lines=lines, advance=advance, stopped=stop)
+            return run(lines=lines, advance=advance, stopped=stop)
     silence_matplotlib()
     # A terminal sends Ctrl-C to workers, too.
     with stop_on_request() as stop:
         return run(stopped=stop)
-
-
-def _take_until_stopped(stopped: Callable[[], bool], jobs: Sequence[ReceiveJob]) -> Iterator[ReceiveJob]:
-    for job in jobs:
-        if stopped():
-            return
-        yield job
 
 
 def _source_name(url: str) -> str:

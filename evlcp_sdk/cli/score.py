@@ -26,16 +26,14 @@ def score(
 
     A result of another link than that of the truth is refused.
     """
-    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.sim.truth import read_truth
     from evlcp_sdk.study.frames import read_frames
     from evlcp_sdk.study.match import check_link
     from evlcp_sdk.study.score import links_of_result, score_frames
 
-    registry = Registry.load()
-    links = links_of_result(folder, registry)
+    links = links_of_result(folder)
     frames = read_frames(folder)
-    truth = read_truth(truth_file, registry)
+    truth = read_truth(truth_file)
     if not links:
         print_stderr(f"{folder}/summary.json: not there, so nothing says with which link it was received")
     else:

@@ -48,13 +48,11 @@ def survey(
     from evlcp_sdk import surveying
     from evlcp_sdk.link.several import load_links
     from evlcp_sdk.place.calibration import read_poses
-    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import AttitudeLog
 
     if (poses is None) == (place.sites is None):
         raise typer.BadParameter("give --poses, or --sites of known bars", param_hint="--poses")
-    registry = Registry.load()
-    links = load_links(link_files, overrides or [], registry)
+    links = load_links(link_files, overrides or [])
     if poses is not None:
         for name, value in (
             ("--attitude", place.attitude_file),
@@ -63,12 +61,12 @@ def survey(
         ):
             if value is not None:
                 raise typer.BadParameter("needs --sites", param_hint=name)
-        surveyed = surveying.survey(recordings, read_poses(poses), links, registry=registry, name=str(poses))
+        surveyed = surveying.survey(recordings, read_poses(poses), links, name=str(poses))
     else:
         plan = place.plan(links)
         assert plan is not None
         known = None if place.attitude_file is None else AttitudeLog.read(place.attitude_file)
-        surveyed = surveying.survey_along_track(recordings, plan, links, attitude=known, registry=registry)
+        surveyed = surveying.survey_along_track(recordings, plan, links, attitude=known)
     _write(surveyed, out, as_json=as_json)
 
 

@@ -54,17 +54,14 @@ def video(
     programs, takes the extra: [bold]pip install 'evlcp-sdk[mp4]'[/]
     """
     from evlcp_sdk.link.several import load_links
-    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import film
 
-    registry = Registry.load()
-    links = load_links(link_files, overrides or [], registry)
+    links = load_links(link_files, overrides or [])
     with bytes_bar(Path(recording).name) as advance:
         summary = film(
             recording,
             out,
             links,
-            registry=registry,
             from_ms=from_ms,
             for_ms=for_ms,
             slow=slow,

@@ -14,7 +14,6 @@ from evlcp_sdk.formatting import round_or_none
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.link.shared import find_differences
 from evlcp_sdk.plugin.records import SUMMARY
-from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.folder import read_summary
 from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.study.frames import FrameRow
@@ -85,7 +84,7 @@ def _bar_figures(bar: Statistics, *, road: bool) -> dict[str, Any]:
     return {key: value for key, value in figures.items() if road or key not in _ROAD_FIGURES}
 
 
-def links_of_result(folder: Path | str, registry: Registry | None = None) -> dict[str, Link]:
+def links_of_result(folder: Path | str) -> dict[str, Link]:
     """The links that a result was received with, from its `summary.json`; none without that file.
 
     A single link has an empty name.
@@ -99,12 +98,12 @@ def links_of_result(folder: Path | str, registry: Registry | None = None) -> dic
         return {}
     path, several = Path(folder) / SUMMARY, summary.get("links")
     if not isinstance(several, dict):
-        return {"": _link_of(path, "", summary, registry)}
-    return {name: _link_of(path, f"links.{name}.", part, registry) for name, part in several.items()}
+        return {"": _link_of(path, "", summary)}
+    return {name: _link_of(path, f"links.{name}.", part) for name, part in several.items()}
 
 
-def _link_of(path: Path, prefix: str, part: Any, registry: Registry | None) -> Link:
+def _link_of(path: Path, prefix: str, part: Any) -> Link:
     table = part.get("configuration") if isinstance(part, dict) else None
     if not isinstance(table, dict):
         raise InputError(f"{path}: {prefix}configuration: expected a table")
-    return resolve(table, registry, source=str(path))
+    return resolve(table, source=str(path))

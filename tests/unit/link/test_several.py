@@ -14,7 +14,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.link.several import find_ambiguous_links, load_links, name_links
 from evlcp_sdk.link.shared import find_differences
-from evlcp_sdk.plugin.registry import Registry
 
 
 @pytest.fixture
@@ -76,7 +75,7 @@ def test_links_whose_characters_the_other_reads_are_named(tmp_path, capsys, rate
     files = [tmp_path / f"{name}.toml" for name in ("bar", "lamp", "other")]
     assert find_ambiguous_links(name_links(load_links(files))) == [("lamp", "other")] * alike
     # It is said on stderr before anything is read.
-    LinkOptions([*map(str, files)]).load(Registry.load())
+    LinkOptions([*map(str, files)]).load()
     message = "evlcp: warning: what one of the links 'lamp' and 'other' sends, the other may read"
     assert [line.startswith(message) for line in capsys.readouterr().err.splitlines()] == [True] * alike
 
