@@ -43,7 +43,6 @@ def calibrate(
         ConfigError: A pose belongs to none of the recordings, a site contradicts its beacon, or too little
             was seen.
     """
-    registry = Registry.load() if registry is None else registry
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
     _check_layouts({"": link})
     _check_recordings(recordings, poses, name)
@@ -96,7 +95,7 @@ def _observe_bars(
     url: str,
     poses: Sequence[KnownPose],
     links: Mapping[str, Link],
-    registry: Registry,
+    registry: Registry | None,
     bars: BarRegistry,
     source: str,
 ) -> tuple[list[tuple[KnownPose, dict[int, BarView]]], dict[int, str]]:
@@ -168,7 +167,6 @@ def survey(
         InputError: A recording cannot be read.
         ConfigError: A pose belongs to none of the recordings, or has no attitude, or too little was seen.
     """
-    registry = Registry.load() if registry is None else registry
     links = name_links(load_links(link, registry=registry))
     placing = select_positioning_links(links)
     _check_layouts(placing)
@@ -224,7 +222,6 @@ def survey_along_track(
         InputError: A recording cannot be read.
         ConfigError: No new bar is in view where the track is known, or too little was seen.
     """
-    registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
     plan.check_links(list(name_links(links)))
     poses: list[KnownPose] = []
@@ -247,7 +244,7 @@ def _track_poses(
     plan: PositionPlan,
     links: Sequence[Link],
     attitude: Attitude | AttitudeLog | None,
-    registry: Registry,
+    registry: Registry | None,
 ) -> tuple[list[KnownPose], list[BarSite], str]:
     """The poses of a recording's own track while new bars are in view, the known bars, and a summary."""
     navigator = Navigator(select_positioning_links(name_links(links)), plan, attitude)

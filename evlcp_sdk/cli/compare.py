@@ -128,8 +128,7 @@ def _compare_recordings(
         raise typer.BadParameter("name at least one, e.g. --variant paper:", param_hint="--variant")
     if duplicates := {url for url in urls if urls.count(url) > 1}:
         raise typer.BadParameter(f"{min(duplicates)} is named twice", param_hint="REC...")
-    registry = Registry.load()
-    variants = load_variants(texts, link_files, overrides, registry)
+    variants = load_variants(texts, link_files, overrides)
     in_process = not workers or len(urls) == 1
     executor = make_executor(0 if in_process else workers, None)
     tables: dict[str, Table] = {}
@@ -141,7 +140,7 @@ def _compare_recordings(
             print_stderr(outcome.fault.message)
             code = max(code, outcome.fault.exit_code)
     ordered = [tables[url] for url in urls if url in tables]
-    return code, comparison_of(ordered, variants, registry.versions())
+    return code, comparison_of(ordered, variants, Registry.load().versions())
 
 
 def _compare_recording(url: str, *, variants: tuple[Variant, ...], in_process: bool) -> Table:

@@ -99,7 +99,7 @@ def bar_bound(
     nearest = _nearest_boundaries(fit, clusters, rows, offset, when)
     _, slopes = _boundary_model(fit, codes, nearest, rows, offset, when)
     slopes = slopes[:4, _select_rows(nearest, np.ones(clusters, np.bool_))]
-    sigma_px = _parameter_sigmas(columns / noise**2 * (slopes @ slopes.T))[0]
+    sigma_px = _first_sigma(columns / noise**2 * (slopes @ slopes.T))
     return float(distance_m * sigma_px / spacing)
 
 
@@ -109,19 +109,16 @@ def _check_positive(**quantities: float) -> None:
             raise ConfigError(f"{name} = {quantity}: expected a positive number")
 
 
-def _parameter_sigmas(information: Array) -> Array:
-    """Standard deviation of each parameter, with the others unknown; infinite where nothing shows it."""
+def _first_sigma(information: Array) -> float:
+    """Standard deviation of the first parameter, with the others unknown; infinite where nothing shows it."""
     own = np.sqrt(np.maximum(np.diag(information), 0.0))
     shown = own > 0
-    sigmas = np.full(len(own), np.inf)
+    if not shown[0]:
+        return math.inf
     scaled = information[np.ix_(shown, shown)] / np.outer(own[shown], own[shown])
-    for i, k in enumerate(np.flatnonzero(shown)):
-        others = np.delete(np.arange(len(scaled)), i)
-        row = scaled[i, others]
-        remaining = 1.0 - row @ np.linalg.pinv(scaled[np.ix_(others, others)], rcond=_MIN_INFORMATION) @ row
-        if remaining > _MIN_INFORMATION:
-            sigmas[k] = 1 / (own[k] * math.sqrt(remaining))
-    return sigmas
+    row = scaled[0, 1:]
+    remaining = 1.0 - row @ np.linalg.pinv(scaled[1:, 1:], rcond=_MIN_INFORMATION) @ row
+    return 1 / (own[0] * math.sqrt(remaining)) if remaining > _MIN_INFORMATION else math.inf
 
 
 def _cluster_codes(codebook: Codebook, symbols: NDArray[np.int64]) -> Array:

@@ -59,7 +59,6 @@ def load_variants(
     texts: Sequence[str],
     path: Path | str | Sequence[Path | str] | None = None,
     overrides: Sequence[str] = (),
-    registry: Registry | None = None,
 ) -> tuple[Variant, ...]:
     """Resolve variants, each `NAME:TABLE.KEY=VALUE,TABLE.KEY=VALUE`; `NAME:` is the link as it is.
 
@@ -72,7 +71,6 @@ def load_variants(
     >>> [v.settings for v in load_variants(["a:", "b:ranging.id=poc,ranging.clusters=[1, 14]"])]
     [(), ('ranging.id=poc', 'ranging.clusters=[1, 14]')]
     """
-    registry = Registry.load() if registry is None else registry
     variants: list[Variant] = []
     faults: list[str] = []
     for text in texts:
@@ -89,7 +87,7 @@ def load_variants(
             faults.append(f"--variant {text}: the name '{name}' is taken by another variant")
             continue
         try:
-            links = load_links(path, [*overrides, *settings], registry)
+            links = load_links(path, [*overrides, *settings])
             variants.append(Variant(name, settings, name_links(links)))
         except ConfigError as fault:
             lines = str(fault).splitlines()
@@ -171,13 +169,12 @@ def compare_recording(
         ConfigError: Its sensor, or the link it was sent with, is not that of a variant.
         InputError: The recording or its truth cannot be read.
     """
-    registry = Registry.load()
     path = truth_path(url)
-    truth = read_truth(path, registry) if path.exists() else None
+    truth = read_truth(path) if path.exists() else None
     if truth is not None:
         for variant in variants:
             check_link(truth, variant.links, f"{url}: --variant {variant.name}")
-    with open_source(url, registry) as source:
+    with open_source(url) as source:
         for link in (link for variant in variants for link in variant.links.values()):
             check_sensor(source, url, link.camera)
         _warm_up(source, variants)
@@ -186,7 +183,7 @@ def compare_recording(
     first_us, last_us = math.inf, -math.inf
     reading = Stopwatch()
     bounds_m: list[float] = []
-    with open_source(url, registry) as source:
+    with open_source(url) as source:
         for number, events in enumerate(_time_chunks(source.chunks(), reading)):
             if events is not None:
                 first_us, last_us = min(first_us, events.t_us[0]), events.t_us[-1]

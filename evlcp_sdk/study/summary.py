@@ -26,7 +26,7 @@ class Series:
 
     Attributes:
         labels: What distinguishes it from other series.
-        scene, link: Identities of its first scene, and of its link.
+        scene, link: Identities of its first scene and of its link; other versions' may lack anything.
         recordings: Statistics of its points, added up seed by seed.
     """
 
@@ -70,13 +70,15 @@ class Series:
             chosen = table.get("ranging", {}).get("clusters")
             return len(chosen) if chosen else BarLayout.of_table(table["bar"]).clusters
         except (TypeError, KeyError, AttributeError, ValueError, ConfigError):
-            # Stored identities of other versions may lack anything.
             return None
 
     @property
     def speed_kmh(self) -> float | None:
         """Speed of the camera, km/h; None if unknown."""
-        return _speed_kmh(self.scene)
+        try:
+            return round(float(self.scene["motion"]["speed_mps"]) * 3.6, 1)
+        except (TypeError, KeyError, ValueError):
+            return None
 
     def tallies_between(self, from_m: int, to_m: int) -> tuple[Tally, ...]:
         """The tally of each recording over the segments between two distances."""
@@ -86,17 +88,6 @@ class Series:
 
 
 _UNITS = {"kmh": "km/h", "mps": "m/s", "m": "m", "us": "us", "s": "s", "hz": "Hz", "mm": "mm", "px": "px"}
-
-
-def _speed_kmh(scene: Any) -> float | None:
-    if isinstance(scene, Mapping):
-        for key, value in scene.items():
-            if key in ("speed_kmh", "speed_mps") and isinstance(value, int | float):
-                return float(value) if key == "speed_kmh" else round(float(value) * 3.6, 1)
-        for value in scene.values():
-            if (found := _speed_kmh(value)) is not None:
-                return found
-    return None
 
 
 @dataclass(frozen=True)

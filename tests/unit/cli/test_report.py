@@ -21,6 +21,7 @@ from tests.unit.study.fake import run_fake
 TWO = "two clusters <!--<script>"
 """In a script element, such a name would keep its end tag from ending it."""
 
+FAST = {"motion": {"speed_mps": 30 / 3.6}}
 CHARTS = ("ber", "rmse", "gross", "found", "histogram")
 
 
@@ -31,8 +32,8 @@ def plan_of_two_methods() -> Plan:
     return Plan(
         "two methods </script>",
         tuple(
-            Case({"speed_kmh": v, "distance_m": 30.0 + 10 * n}, {"n": n}, {"n": n, "speed_kmh": v})
-            for v in (20, 30)
+            Case({"speed_kmh": v, "distance_m": 30.0 + 10 * n}, {"n": n}, {"n": n, "motion": motion})
+            for v, motion in ((20, {"speed_mps": 20 / 3.6}), (30, {"speed_mps": 30 / 3.6}))
             for n in range(5)
         ),
         tuple(
@@ -74,7 +75,7 @@ def test_the_paper_is_held_beside_the_series_it_speaks_of(summary: Summary) -> N
     assert sum(c.reference.measure == "ber" for c in found) == 2
     # Beside a bound stands the worst segment; the scenes are the harder, the farther.
     assert {c.from_m for c in found if c.reference.measure == "ber"} == {70}
-    ours = Series({}, {"speed_kmh": 30}, summary.series[0].link, ())
+    ours = Series({}, FAST, summary.series[0].link, ())
     assert compare_with_paper([ours]) == []
 
 
@@ -91,14 +92,14 @@ def test_a_smaller_figure_is_better_and_a_kept_bound_agrees(summary: Summary) ->
         ):
             tally = Tally.of_distance(reference.value * factor)
             at = Statistics.of([(reference.from_m, tally)], tasks=1)
-            (one,) = compare_with_paper([Series({}, {"speed_kmh": 30}, link, (at,))], [reference])
+            (one,) = compare_with_paper([Series({}, FAST, link, (at,))], [reference])
             assert one.verdict == verdict, (reference, factor)
 
 
 def test_a_limit_stands_above_the_paper_for_no_want_of_data(summary: Summary) -> None:
     """3.7 / 400 distances are a limit above the paper's .004, 3.7 / 1200 are none."""
     at = Statistics.of([(m, Tally.of_distance(0.0)) for m in (30, 40, 50) for _ in range(400)], tasks=1)
-    series = Series({"scene.speed_kmh": 30}, {"speed_kmh": 30}, summary.series[0].link, (at,))
+    series = Series({"scene.speed_kmh": 30}, FAST, summary.series[0].link, (at,))
     (gross,) = (one for one in draw_charts(replace(summary, series=(series,))) if one.id == "gross")
     (shown,) = [text.splitlines()[1] for *_, text, _ in gross.labels if text.startswith(series.name)]
     assert shown.startswith("30 to 60 m: below 0.0031")
