@@ -15,7 +15,8 @@ from tempfile import TemporaryDirectory
 
 from evlcp_sdk.link.several import load_links, name_links
 from evlcp_sdk.live import Budget, Publisher
-from evlcp_sdk.live.services import ServiceOptions, serve
+from evlcp_sdk.live.server import serve
+from evlcp_sdk.live.viewer import Viewer
 from evlcp_sdk.place.navigator import PositionPlan
 from evlcp_sdk.run import live
 from evlcp_sdk.scene.attitude import AttitudeLog
@@ -38,11 +39,11 @@ def main() -> None:
 
     links, publisher, sites = load_links(None), Publisher(), load_sites(given.sites)
     attitude = AttitudeLog.read(given.attitude)
-    serving = ServiceOptions(view=True)
+    view = Viewer(publisher, name_links(links), name=given.recording.name, sites=sites)
     over = threading.Event()
     with (
         TemporaryDirectory() as folder,
-        serve(serving, publisher, name_links(links), name=given.recording.name, sites=sites) as services,
+        serve(publisher, [view]),
         Browser(Path(folder)) as browser,
     ):
         # Or else it tells of every picture that the page gets.
@@ -51,7 +52,7 @@ def main() -> None:
         browser.say(
             "Emulation.setDeviceMetricsOverride", width=1280, height=HIGH, deviceScaleFactor=1, mobile=False
         )
-        browser.open(services["view"].url)
+        browser.open(view.url)
         runner = threading.Thread(
             target=live,
             args=(f"replay:{given.recording}?speed={1 / SLOWER}", None, links),

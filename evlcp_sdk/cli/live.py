@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.live.loop import LiveStatus
     from evlcp_sdk.live.publisher import Publisher
-    from evlcp_sdk.live.services import ServiceOptions
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.utc import ClockZero
 
@@ -69,28 +68,17 @@ class ServingOptions:
         typer.Option("--gpsd-port", min=0, max=65535, metavar="PORT", help="Serve positions as gpsd does."),
     ] = None
 
-    def to_options(self, out: Path | None, *, positions: bool) -> ServiceOptions:
-        """The services; recordings go into `out`, or this folder."""
-        from evlcp_sdk.live.services import ServiceOptions
-
-        for name, port in (("--nmea-port", self.nmea_port), ("--gpsd-port", self.gpsd_port)):
-            if port is not None and not positions:
-                raise typer.BadParameter("needs --sites", param_hint=name)
-        for name, is_given in (
-            ("--view-host", self.view_host != _HERE),
-            ("--view-port", self.view_port != 0),
-            ("--view-record", self.view_record),
+    def check(self, *, positions: bool) -> None:
+        """Refuse options that need others."""
+        for name, needed, lacks in (
+            ("--nmea-port", "--sites", self.nmea_port is not None and not positions),
+            ("--gpsd-port", "--sites", self.gpsd_port is not None and not positions),
+            ("--view-host", "--view", self.view_host != _HERE and not self.view),
+            ("--view-port", "--view", self.view_port != 0 and not self.view),
+            ("--view-record", "--view", self.view_record and not self.view),
         ):
-            if is_given and not self.view:
-                raise typer.BadParameter("needs --view", param_hint=name)
-        return ServiceOptions(
-            self.view,
-            self.view_host,
-            self.view_port,
-            (out or Path.cwd()) if self.view_record else None,
-            self.nmea_port,
-            self.gpsd_port,
-        )
+            if lacks:
+                raise typer.BadParameter(f"needs {needed}", param_hint=name)
 
 
 Waiting = Annotated[
@@ -135,12 +123,12 @@ def live(
     links = link.load()
     plan = place.plan(links, mcap=result.mcap)
     clock = camera.clock(place)
-    services = serving.to_options(out, positions=plan is not None)
+    serving.check(positions=plan is not None)
     sinks = result.load_sink_names(positions=plan is not None)
     attitude, publisher = camera.attitude(place), Publisher()
     with (
         stop_on_request() as stopped,
-        _serve(services, publisher, links, url, plan, clock),
+        _serve(serving, publisher, links, url, plan, clock, out),
         _show_status(publisher, silent=lines is not None),
     ):
         summary = run_live(
@@ -164,21 +152,41 @@ def live(
 
 @contextmanager
 def _serve(
-    options: ServiceOptions,
+    options: ServingOptions,
     publisher: Publisher,
     links: Sequence[Link],
     url: str,
     plan: PositionPlan | None,
     clock: ClockZero,
+    out: Path | None,
 ) -> Iterator[None]:
+    """Serve what is asked for, and print where; browsers record into `out`, or this folder."""
     from evlcp_sdk.link.several import name_links
-    from evlcp_sdk.live.services import serve
+    from evlcp_sdk.live.recorder import Recorder
+    from evlcp_sdk.live.server import Server, serve
+    from evlcp_sdk.live.tcp_output import TcpOutput
+    from evlcp_sdk.live.viewer import Viewer
 
-    sites = plan.sites if plan is not None else ()
-    names = name_links(links)
-    with serve(options, publisher, names, name=Path(url).name, sites=sites, clock_zero=clock) as services:
-        for name, server in services.items():
-            print_stderr(f"{_SERVED[name]} at {server.url}")
+    camera, recorder = links[0].camera, None
+    if options.view_record:
+        recorder = Recorder(publisher, out or Path.cwd(), camera.width, camera.height)
+    servers: dict[str, Server] = {}
+    if options.view:
+        servers["view"] = Viewer(
+            publisher,
+            name_links(links),
+            name=Path(url).name,
+            sites=plan.sites if plan is not None else (),
+            host=options.view_host,
+            port=options.view_port,
+            recorder=recorder,
+        )
+    for kind, port in (("nmea", options.nmea_port), ("gpsd", options.gpsd_port)):
+        if port is not None:
+            servers[kind] = TcpOutput(publisher, gpsd=kind == "gpsd", port=port, clock_zero=clock)
+    with serve(publisher, servers.values(), recorder) if servers else nullcontext():
+        for kind, server in servers.items():
+            print_stderr(f"{_SERVED[kind]} at {server.url}")
         yield
 
 

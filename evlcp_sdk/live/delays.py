@@ -4,6 +4,8 @@ import math
 from collections import Counter
 from typing import Final
 
+from evlcp_sdk.formatting import round_or_none
+
 _RANGE_MS: Final = (1e-3, 1e6)
 _CELLS_PER_E: Final = 50
 """Of 2 % each, for a factor of e."""
@@ -43,11 +45,9 @@ class DelayTally:
 
     def to_dict(self) -> dict[str, float | int | None]:
         """Count, p50, p99 and maximum, ms, as JSON values."""
-        if not self.count:
-            return {"count": 0, "p50_ms": None, "p99_ms": None, "max_ms": None}
         return {
             "count": self.count,
-            "p50_ms": round(self.quantile_ms(0.5), 3),
-            "p99_ms": round(self.quantile_ms(0.99), 3),
-            "max_ms": round(self.max_ms, 3),
+            "p50_ms": round_or_none(self.quantile_ms(0.5), 3),
+            "p99_ms": round_or_none(self.quantile_ms(0.99), 3),
+            "max_ms": round(self.max_ms, 3) if self.count else None,
         }

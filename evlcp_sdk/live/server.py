@@ -4,11 +4,13 @@ import asyncio
 import os
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any, Self, TypeVar
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.live.publisher import Publisher
+from evlcp_sdk.live.recorder import Recorder
 
 _T = TypeVar("_T")
 
@@ -32,11 +34,7 @@ class LoopThread:
 
     def finish(self, task: "asyncio.Task[None]") -> None:
         """Wait until a task is done, for `FINISH_S` at most."""
-
-        async def wait() -> None:
-            await asyncio.wait([task], timeout=FINISH_S)
-
-        self.call(wait())
+        self.call(asyncio.wait([task], timeout=FINISH_S))
 
     def _run(self) -> None:
         with asyncio.Runner(loop_factory=lambda: self.loop) as runner:
@@ -97,8 +95,7 @@ class Server(ABC):
     async def _send_news(self) -> None:
         """Send news until the subscription ends."""
 
-    @abstractmethod
-    def _abort(self) -> None:
+    def _abort(self) -> None:  # noqa: B027
         """Close connections that the end of the loop leaves open."""
 
     async def start(self) -> "asyncio.Task[None]":
@@ -132,3 +129,22 @@ class Server(ABC):
                 listening.close()
 
         return asyncio.create_task(serve())
+
+
+@contextmanager
+def serve(
+    publisher: Publisher, servers: Iterable[Server], recorder: Recorder | None = None
+) -> Iterator[None]:
+    """Serve in a thread beside a live run; at the end, close the publisher and complete a recording.
+
+    Raises:
+        ConfigError: A port cannot be used, or a package is not installed.
+    """
+    with ExitStack() as stack:
+        loop_thread = stack.enter_context(LoopThread())
+        for server in servers:
+            stack.callback(loop_thread.finish, loop_thread.call(server.start()))
+        stack.callback(publisher.close)
+        if recorder is not None:
+            stack.callback(recorder.close)
+        yield

@@ -65,9 +65,6 @@ class TcpOutput(Server):
             for news in self._subscription.take(0):
                 self._send_fix(news)
 
-    def _abort(self) -> None:
-        return
-
     def _send_fix(self, news: News) -> None:
         if self._zero is None:
             self._zero = datetime.now(UTC) - timedelta(microseconds=news.t_us)

@@ -11,15 +11,16 @@ import pynmea2
 import pytest
 
 from evlcp_sdk.live import Publisher
-from evlcp_sdk.live.server import Server
-from evlcp_sdk.live.services import ServiceOptions, serve
-from tests.unit.live.helpers import LINKS, dies, publish_fix
+from evlcp_sdk.live.server import Server, serve
+from evlcp_sdk.live.tcp_output import TcpOutput
+from tests.unit.live.helpers import dies, publish_fix
 
 
 @pytest.fixture
 def served() -> Iterator[tuple[Publisher, dict[str, Server]]]:
     publisher = Publisher()
-    with serve(ServiceOptions(nmea_port=0, gpsd_port=0), publisher, LINKS, name="x") as services:
+    services = {kind: TcpOutput(publisher, gpsd=kind == "gpsd") for kind in ("nmea", "gpsd")}
+    with serve(publisher, services.values()):
         yield publisher, services
         publisher.close()
 

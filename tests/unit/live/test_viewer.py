@@ -25,7 +25,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io.open import open_source
 from evlcp_sdk.live import Publisher, server
 from evlcp_sdk.live.recorder import Recorder
-from evlcp_sdk.live.services import ServiceOptions, serve
+from evlcp_sdk.live.server import serve
 from evlcp_sdk.live.viewer import Viewer, render_viewer_page
 from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.run import live
@@ -72,12 +72,12 @@ class Stage:
 
 
 @contextmanager
-def run_viewer(**given: Any) -> Iterator[Stage]:
+def run_viewer(record_to: Path | None = None, **given: Any) -> Iterator[Stage]:
     publisher = Publisher()
-    with serve(
-        ServiceOptions(view=True, **given), publisher, LINKS, name="a name", sites=(SITE,)
-    ) as services:
-        yield Stage(publisher, services["view"])  # type: ignore[arg-type]
+    recorder = Recorder(publisher, record_to, 1280, 720) if record_to is not None else None
+    view = Viewer(publisher, LINKS, name="a name", sites=(SITE,), recorder=recorder, **given)
+    with serve(publisher, [view], recorder):
+        yield Stage(publisher, view)
         publisher.close()
 
 
