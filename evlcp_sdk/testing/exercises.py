@@ -15,7 +15,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES, STEPS
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compile_or_skip
 from evlcp_sdk.testing.recordings import IdealBar, bar_in_sight, ideal_events, random_symbols
-from evlcp_sdk.testing.views import ideal_frame, ideal_sums, ideal_view
+from evlcp_sdk.testing.views import ideal_frame, ideal_presence, ideal_sums, ideal_view
 from evlcp_sdk.values import Events
 
 ONE_CLUSTER = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
@@ -94,31 +94,34 @@ _ARGUMENTS: dict[str, Callable[[Link], tuple[Any, ...]]] = {
 }
 
 
-def compile_arguments(subject: Subject) -> tuple[Any, ...]:
-    """Return the arguments of the subject's `compile`."""
-    return _ARGUMENTS[subject.role](link_of(subject))
-
-
-def compile_with(subject: Subject, arguments: tuple[Any, ...]) -> Any:
-    """Compile the subject; raise an InapplicableLawError if the receiver does its work itself."""
+def compile_on(subject: Subject, link: Link) -> Any:
+    """Compile the subject on a link; raise an InapplicableLawError if the receiver does its work itself."""
     rhythmic = subject.role == "detection" and subject.algorithm.rhythmic
     if rhythmic or (subject.role == "framing" and subject.algorithm.roles >= STEPS):
         raise InapplicableLawError("the receiver does this by itself")
-    return subject.algorithm.compile(*arguments)
+    return subject.algorithm.compile(*_ARGUMENTS[subject.role](link))
 
 
 def compile_subject(subject: Subject) -> Any:
     """Compile the subject on its link if it accepts that; a role without `compile` returns itself."""
     if subject.role not in _ARGUMENTS:
         return subject.algorithm
-    arguments = compile_arguments(subject)
-    return compile_or_skip(lambda: compile_with(subject, arguments))
+    link = link_of(subject)
+    return compile_or_skip(lambda: compile_on(subject, link))
 
 
 def pilot_sums(link: Link, missing: float = 0.0, seed: int = 0) -> np.ndarray[Any, np.dtype[np.int16]]:
     """Return the polarity sums of the pilot of an ideal frame, int16 (pilot chips, height, width)."""
     sums = ideal_sums(link.codebook, symbols_of(link.codebook), missing=missing, seed=seed)
     return sums[: link.packet.pilot_chips]
+
+
+def locate_clusters(separate: Any, sums: np.ndarray[Any, Any], clusters: int) -> tuple[Any, float]:
+    """Return the share of each cluster's pixels that is selected, and that of the selected ones in place."""
+    found, shown = separate(sums), ideal_presence(clusters).pixels > 0
+    cells = found.selected.repeat(found.grid_px, 1).repeat(found.grid_px, 2)
+    inside = cells & shown[:, : cells.shape[1], : cells.shape[2]]
+    return inside.sum((1, 2)) / shown.sum((1, 2)), inside.sum() / max(cells.sum(), 1)
 
 
 def symbols_of(codebook: Codebook, seed: int = 0) -> np.ndarray[Any, np.dtype[np.int64]]:

@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.specs import make_model
-from evlcp_sdk.testing.exercises import compile_arguments, compile_with, make_exercise
+from evlcp_sdk.testing.exercises import compile_on, link_of, make_exercise
 from evlcp_sdk.testing.law import LawError, Subject, expect, expect_same, law
 from evlcp_sdk.testing.trees import map_arrays
 
@@ -77,7 +77,7 @@ def _check_pickle(subject: Subject) -> None:
 @law("compiles", "compiles for the camera, bar and codebook of the link")
 def _check_compile(subject: Subject) -> None:
     try:
-        compile_with(subject, compile_arguments(subject))
+        compile_on(subject, link_of(subject))
     except ConfigError as refused:
         owner = "the default" if subject.link is None else "the link's"
         raise LawError(f"expected {owner} camera, bar and codebook to do, got: {refused}") from refused

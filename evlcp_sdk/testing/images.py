@@ -10,10 +10,17 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Decode
-from evlcp_sdk.testing.exercises import compile_subject, link_of, pilot_sums, require_column, symbols_of
+from evlcp_sdk.testing.exercises import (
+    compile_subject,
+    link_of,
+    locate_clusters,
+    pilot_sums,
+    require_column,
+    symbols_of,
+)
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compile_or_skip, expect, law
 from evlcp_sdk.testing.trees import map_arrays
-from evlcp_sdk.testing.views import GRID_PX, ideal_frame, ideal_presence, ideal_view
+from evlcp_sdk.testing.views import GRID_PX, ideal_frame, ideal_view
 from evlcp_sdk.values import PresenceMap, Range, SoftSymbols
 
 _SPACINGS_PX = (4, 6, 8, 10, 12, 14)
@@ -59,16 +66,12 @@ def _check_separation_shapes(subject: Subject) -> None:
 @law("finds-clusters", "each cluster of an ideal image is found in its place")
 def _check_clusters_found(subject: Subject) -> None:
     link, separate = link_of(subject), compile_subject(subject)
-    shown = ideal_presence(link.codebook.clusters).pixels > 0
     for seed in range(_SEEDS):
-        found = separate(pilot_sums(link, 0.2 * (seed > 0), seed))
-        cells = found.selected.repeat(found.grid_px, 1).repeat(found.grid_px, 2)
-        inside = cells & shown[:, : cells.shape[1], : cells.shape[2]]
-        share = inside.sum((1, 2)) / shown.sum((1, 2))
+        sums = pilot_sums(link, 0.2 * (seed > 0), seed)
+        share, placed = locate_clusters(separate, sums, link.codebook.clusters)
         least = f"{share.min():.0%} of cluster {share.argmin()}"
         expect((share >= 0.5).all(), f"half of each cluster's pixels selected or more, got {least}")
-        right = inside.sum() / max(cells.sum(), 1)
-        expect(right >= 0.9, f"nine tenths of what is selected in its place, got {right:.0%}")
+        expect(placed >= 0.9, f"nine tenths of what is selected in its place, got {placed:.0%}")
 
 
 @law("sees-nothing", "without events there is no cluster")
