@@ -338,7 +338,7 @@ def live(
                 clock_zero=clock_zero,
                 sinks=sinks,
                 lines=lines,
-                on_fix=lambda placed: loop.publish_fix(placed),
+                on_fix=lambda placed: publisher.publish("fix", placed.fix.t_us, placed),
             ) as writer:
                 receiver = Receiver(
                     links,

@@ -95,10 +95,6 @@ class Shedder:
         self.counts[name] += len(events) - int(np.count_nonzero(kept))
         return events[kept]
 
-    def count_dropped(self, events: Events) -> None:
-        """Count the events of a dropped slice."""
-        self.counts["too_late"] += len(events)
-
 
 def _extend(centre_px: float, size_px: float, limit: int) -> tuple[int, int]:
     """First row or column of a region with its margin, and the one after its last."""

@@ -13,7 +13,6 @@ from evlcp_sdk.live.budget import LEVELS, RANGING_EVERY, Budget, Shedder
 from evlcp_sdk.live.delays import DelayTally
 from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.reader import Reader, Slice
-from evlcp_sdk.place.navigator import Placed
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.signals import Stopped
@@ -115,7 +114,6 @@ class LiveLoop:
             InputError: The source cannot be read on.
         """
         self._start_s = self._status_s = self._taken_s = time.monotonic()
-        self._reader.start()
         try:
             while not stopped():
                 piece = self._reader.take(_IDLE_S)
@@ -156,10 +154,6 @@ class LiveLoop:
         host_s = self._source.clock_s(t_us)
         return self._reader.arrivals.to_host_s(t_us) if host_s is None else host_s
 
-    def publish_fix(self, placed: Placed) -> None:
-        """Publish a fix."""
-        self._publisher.publish("fix", placed.fix.t_us, placed)
-
     def summary(self) -> dict[str, Any]:
         """Delays by stage, what was shed, and the time at each level, as JSON values."""
         return {
@@ -189,7 +183,7 @@ class LiveLoop:
             if newer is None:
                 break
             self._publish_raw(piece)
-            self._shedder.count_dropped(piece.events)
+            self._shedder.counts["too_late"] += len(piece.events)
             piece, pieces = newer, [newer]
         events = len(piece.events)
         while events < _MAX_BATCH_EVENTS and taken_s - piece.arrived_s > _BATCH_AFTER_S:

@@ -56,7 +56,7 @@ class ArrivalClock:
 
 
 class Reader:
-    """The slices of a source, read ahead by a thread; the source is not closed.
+    """The slices of a source, read ahead by a thread from now on; the source is not closed.
 
     Beyond `_MAX_EVENTS`, the oldest of a live source are dropped; any other source waits.
 
@@ -76,9 +76,6 @@ class Reader:
         self.dropped = 0
         self.fault: BaseException | None = None
         self._thread = threading.Thread(target=self._read, name="evlcp-reader", daemon=True)
-
-    def start(self) -> None:
-        """Start the thread."""
         self._thread.start()
 
     @property

@@ -184,7 +184,6 @@ class Counted(EventSource):
 def read_all(source: Counted) -> tuple[Reader, list[int]]:
     """A reader that has read all there is, or all that it may, before it is asked; and what it gives."""
     reader, got = Reader(source), []
-    reader.start()
     if source.live:
         assert source.all_taken.wait(60)
     while not reader.ended:
