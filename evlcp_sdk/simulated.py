@@ -85,7 +85,7 @@ class SimulatedSource(EventSource):
             for path, text in survey.items():
                 outputs.write_text(text, path)
             size = outputs.path(out).stat().st_size
-            outputs.write_text(json.dumps(self.truth.to_table() | {"bytes": size}), truth_file)
+            outputs.write_text(json.dumps({**self.truth.table, "bytes": size}), truth_file)
             outputs.commit()
         return (out, truth_file, *survey)
 

@@ -186,7 +186,7 @@ def compare() -> None:
         print("no ../shared/recordings: comparison left out")
         return
     truth = read_truth(SHARED / "night-50m-30kmh.truth.json")
-    scene = scene_of_truth(truth.to_table())
+    scene = scene_of_truth(truth.table)
     columns = []
     for events, truth_ in (
         (read_events(SHARED / "night-50m-30kmh.raw"), truth),
@@ -206,7 +206,7 @@ def compare() -> None:
     print("| | Mev/s | ON share | frames | wrong bits | RMSE m (95 %) |\n|---|---|---|---|---|---|")
     for path in paths:
         truth = read_truth(path.with_suffix(".truth.json"))
-        made = scene_of_truth(truth.to_table())
+        made = scene_of_truth(truth.table)
         for name, events, truth_ in (
             (path.stem, read_events(path), truth),
             ("simulated", Events.concat(Simulation(made).stream()), truth_of(made)),
@@ -230,7 +230,7 @@ def compare_road() -> None:
     print("| recording | Mev/s | here | share of ON events | here |\n|---|---|---|---|---|")
     for path in paths:
         truth = read_truth(path.with_suffix(".truth.json"))
-        made = scene_of_truth(truth.to_table())
+        made = scene_of_truth(truth.table)
         theirs, ours = read_events(path), Events.concat(Simulation(made).stream())
         rates = (f"{len(events) / made.duration_s / 1e6:.2f}" for events in (theirs, ours))
         shares = (f"{events.p.mean():.3f}" for events in (theirs, ours))

@@ -29,10 +29,11 @@ def truth_of(
 ) -> Truth:
     """Return the truth of a simulation, with the counts if it has run; or of a scene, without rendering it.
 
-    In its table, `scene` has the scene's parameters; `psf_sigma_px` and `e_led` the blur and the light of
-    each bar; `others` the reflections: of which bar (`src`), how bright relative to it (`gain`) and where in
-    the image; `simulator` the resolved scene, which renders the recording again. Bars, reflections and camera
-    are sampled every millisecond. A `seed` replaces the scene's.
+    In its table, `scene` has the scene's parameters; `links` the bars' links by digest; `psf_sigma_px` and
+    `e_led` the blur and the light of each bar; `others` the reflections: of which bar (`src`), how bright
+    relative to it (`gain`) and where in the image; `simulator` the resolved scene, which renders the
+    recording again. Bars, reflections and camera are sampled every millisecond. A `seed` replaces the
+    scene's.
 
     Raises:
         ConfigError: The scene cannot be rendered.
@@ -43,6 +44,7 @@ def truth_of(
     )
     scene = simulation.scene
     camera = scene.camera
+    links = {light.link.digest: light.link for light in simulation.bars}
     t_s = np.arange(max(1, round(scene.duration_s * 1000))) / 1000
     position, attitude = simulation.path.sample(t_s * 1e6)
     centres = np.array([b.centre_m for b in simulation.bars]).reshape(-1, 3)
@@ -50,6 +52,10 @@ def truth_of(
     found: dict[str, Any] = {
         "scene": _describe_scene(simulation),
         "bars": [_describe_bar(light, scene.duration_s) for light in simulation.bars],
+        "links": {
+            digest: {"table": link.table, "codebook": link.codebook.digest, "revisions": link.revisions}
+            for digest, link in links.items()
+        },
         "others": _locate_reflections(simulation, position, attitude),
         "camera": _pick_fields(camera, "focal_mm", "pitch_um", "width", "height")
         | dict(zip(("cx", "cy"), camera.centre_px, strict=True)),
@@ -69,7 +75,7 @@ def truth_of(
         found["camera_path"] |= locate_camera(scene, position, attitude)
     if simulation.done_s:
         found |= simulation.counts
-    return truth_from_table(found, links={light.link.digest: light.link for light in simulation.bars})
+    return truth_from_table(found, links=links)
 
 
 def _round_rows(rows: Floats, digits: int) -> list[list[float]]:
@@ -81,19 +87,26 @@ def _pick_fields(description: object, *names: str) -> dict[str, Any]:
 
 
 def _describe_bar(light: BarLight, duration_s: float) -> dict[str, Any]:
-    bar = light.bar
-    found = {
-        **_pick_fields(bar, "x_m", "y_m", "z_m", "width_m", "ppm", "led_w_m2", "chips_file", "payload"),
-        "length_m": light.link.bar.length_m,
-        "link": light.link.digest,
-        "seed": light.payload_seed,
-        "start_chip": light.start_chip,
-        "symbols": light.list_symbols(duration_s),
+    """A bar's values; the number of clusters and the like, which its link has, are for other readers."""
+    bar, link = light.bar, light.link
+    hidden: dict[str, Any] = {
         "covered": sorted({*bar.covered, *light.dark}),
         "cover_s": [list(span) for span in bar.cover_s],
         "pole_s": [list(span) for span in bar.pole_s],
     }
-    return found if bar.chips_file is None else found | {"packet_chips": light.packet_chips}
+    return {
+        "link": link.digest,
+        "profile": link.codebook.profile,
+        "clusters": link.codebook.clusters,
+        **_pick_fields(link.packet, "frames", "pilot_every"),
+        "packet_chips": light.packet_chips,
+        **_pick_fields(bar, "x_m", "y_m", "z_m", "width_m", "ppm", "led_w_m2", "chips_file", "payload"),
+        "length_m": link.bar.length_m,
+        "seed": light.payload_seed,
+        "start_chip": light.start_chip,
+        "symbols": light.list_symbols(duration_s),
+        **{key: values for key, values in hidden.items() if values},
+    }
 
 
 def _describe_scene(simulation: Simulation) -> dict[str, Any]:

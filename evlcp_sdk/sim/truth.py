@@ -1,7 +1,7 @@
 """The truth of a recording: what each bar sent, with which link, and where it was in the image."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -95,7 +95,7 @@ class Truth:
         camera_path: Arrays of the camera at `t_us`: latitude_deg, longitude_deg, height_m, heading_deg,
             pitch_deg, roll_deg, float64 (n,), in a scene on earth; position_m and attitude_deg, float64
             (3, n), in the scene's axes. Empty if the file has none.
-        table: The rest of the JSON: scene, camera, simulator, counts, and under `bars` the rest of each bar.
+        table: The JSON values of `REC.truth.json`, with scene, simulator and counts, too.
         warnings: Differences from this installation, in words.
     """
 
@@ -107,35 +107,6 @@ class Truth:
     camera_path: Mapping[str, Floats]
     table: Mapping[str, Any]
     warnings: tuple[str, ...] = ()
-
-    def to_table(self) -> dict[str, Any]:
-        """Convert to the JSON values of `REC.truth.json`, for `truth_from_table`.
-
-        A bar's `profile`, `clusters`, `frames`, `pilot_every` and `packet_chips` are there for other readers;
-        its `link` is the digest of one of the `links`.
-        """
-        links = {bar.link.digest: bar.link for bar in self.bars}
-        found = dict(self.table)
-        found["scene"] = {**found.get("scene", {}), "t0_us": self.t0_us}
-        found["scene"].setdefault("duration_s", self.duration_us / 1e6)
-        rest = found.get("bars", ({},) * len(self.bars))
-        found["bars"] = [{**_to_bar_table(bar), **more} for bar, more in zip(self.bars, rest, strict=True)]
-        found["links"] = {
-            digest: {
-                "table": {section: dict(keys) for section, keys in link.table.items()},
-                "codebook": link.codebook.digest,
-                "revisions": dict(link.revisions),
-            }
-            for digest, link in links.items()
-        }
-        found["t_s"] = [round(t / 1e6, 9) for t in self.t_us.tolist()]
-        found["distance_m"] = [bar.distance_m.tolist() for bar in self.bars]
-        found["bar_centre_px"] = [bar.centre_px.T.tolist() for bar in self.bars]
-        if self.sites:
-            found["sites"] = [asdict(site) for site in self.sites]
-        if self.camera_path:
-            found["camera_path"] = {key: values.tolist() for key, values in self.camera_path.items()}
-        return found
 
 
 def truth_path(url: Path | str) -> Path:
@@ -207,50 +178,9 @@ def truth_from_table(
         bars=tuple(bars),
         sites=_parse_sites(found, source),
         camera_path=path,
-        table=_keep_other_keys(table),
+        table=table,
         warnings=tuple(warnings),
     )
-
-
-_TRUTH_KEYS = ("bars", "t_s", "distance_m", "bar_centre_px", "links", "sites", "camera_path")
-"""Keys of the table that are attributes of a `Truth`."""
-
-_BAR_KEYS = ("link", "symbols", "start_chip", "ppm", "payload", "covered", "cover_s", "pole_s")
-"""Keys of a bar's table that are attributes of a `SentBar`; below, those that follow from its link."""
-
-_LINK_KEYS = ("profile", "clusters", "frames", "pilot_every", "packet_chips")
-
-
-def _keep_other_keys(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the rest of a truth's table; bars with chips of a file keep what else is in their link."""
-    rest = {key: value for key, value in table.items() if key not in _TRUTH_KEYS}
-    bars = [
-        (row, _BAR_KEYS if row.get("chips_file") is not None else _BAR_KEYS + _LINK_KEYS)
-        for row in table["bars"]
-    ]
-    rest["bars"] = tuple({key: row[key] for key in row if key not in held} for row, held in bars)
-    return rest
-
-
-def _to_bar_table(bar: SentBar) -> dict[str, Any]:
-    form = bar.link.packet
-    return {
-        "link": bar.link.digest,
-        "profile": bar.link.codebook.profile,
-        "clusters": bar.clusters,
-        "frames": form.frames,
-        "pilot_every": form.pilot_every,
-        "packet_chips": form.packet_chips,
-        "ppm": bar.ppm,
-        "start_chip": bar.start_chip,
-        "payload": bar.payload,
-        "symbols": bar.symbols.tolist(),
-        "led_w_m2": None if bar.lit else 0.0,
-        "chips_file": None,
-        **({"covered": list(bar.covered)} if bar.covered else {}),
-        **({"cover_s": [list(span) for span in bar.cover_s]} if bar.cover_s else {}),
-        **({"pole_s": [list(span) for span in bar.pole_s]} if bar.pole_s else {}),
-    }
 
 
 _Number = Annotated[float, Field(ge=-_MAX_VALUE, le=_MAX_VALUE)]

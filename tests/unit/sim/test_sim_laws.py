@@ -65,9 +65,9 @@ def test_dark_and_passed_bars_give_nothing() -> None:
 
 def test_the_truth_counts_what_was_rendered() -> None:
     simulation = Simulation(SHORT)
-    assert "events" not in truth_of(simulation).to_table()
+    assert "events" not in truth_of(simulation).table
     events = sum(map(len, simulation.stream()))
-    found = truth_of(simulation).to_table()
+    found = truth_of(simulation).table
     assert found["events"] == events
     assert found["signal_events"] + 30_000 > events
     assert len(found["t_s"]) == len(found["distance_m"][1]) == len(found["bar_centre_px"][1][0]) == 30

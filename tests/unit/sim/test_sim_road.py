@@ -67,7 +67,7 @@ def test_an_image_is_a_dimmer_bar_at_another_place(image, place, tmp_path, monke
 def test_a_window_turns_the_light() -> None:
     image = ReflectionSpec("window", turn_deg=(0.4, -0.2))
     scene = Scene(motion=STILL, reflections=(image,))
-    table = truth_of(scene).to_table()
+    table = truth_of(scene).table
     (ghost,) = table["others"]
     (column, row), (ghost_column, ghost_row) = (
         [axis[0] for axis in place] for place in (table["bar_centre_px"][0], ghost.pop("centre_px"))
@@ -291,7 +291,7 @@ def test_all_that_a_road_adds_does_not_depend_on_threads_or_length() -> None:
     long = every(replace(scene, duration_s=0.014))
     until = 7_900
     assert rows(events[events.t_us < until]) == rows(long[long.t_us < until])
-    table = json.loads(json.dumps(truth_of(scene).to_table()))
+    table = json.loads(json.dumps(truth_of(scene).table))
     assert resolve_scene(table["simulator"]) == scene
     assert resolve_scene(json.loads(json.dumps(asdict(scene)))) == scene
 

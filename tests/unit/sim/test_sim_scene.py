@@ -137,7 +137,7 @@ def test_a_path_of_a_file_is_followed(tmp_path: Path) -> None:
     position, attitude = CameraPath(scene.motion, 0.2, 0).sample([1e5])
     assert position[0] == pytest.approx([0.3, 0.1, -39])
     assert np.degrees(attitude[0]) == pytest.approx([0.5, -0.2, 2])
-    assert truth_of(scene).to_table()["distance_m"][0][100] == pytest.approx(39, abs=0.05)
+    assert truth_of(scene).table["distance_m"][0][100] == pytest.approx(39, abs=0.05)
     with pytest.raises(ConfigError, match=r"lasts from 0\.0 to 0\.2 s"):
         Simulation(load_scene(tmp_path / "scene.toml", ["duration_s=0.3"]))
     ahead = [line.replace("-", "") for line in lines]

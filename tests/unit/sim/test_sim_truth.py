@@ -23,7 +23,7 @@ def with_revision(role: str, target: str, revision: int) -> Registry:
 
 
 def plain(truth: Truth) -> dict[str, Any]:
-    return json.loads(json.dumps(truth.to_table()))
+    return json.loads(json.dumps(truth.table))
 
 
 def test_a_truth_comes_back_from_its_file(tmp_path: Path) -> None:
@@ -39,7 +39,7 @@ def test_a_truth_comes_back_from_its_file(tmp_path: Path) -> None:
     assert [bar.rate_hz for bar in known.bars] == pytest.approx([10_000.3, 5000.0, 10_000.0])
     assert len(known.sites) == 3
     path = tmp_path / "REC.truth.json"
-    path.write_text(json.dumps(known.to_table()))
+    path.write_text(json.dumps(known.table))
     table = plain(known)
     assert plain(read_truth(path)) == table
     assert sorted(table["links"]) == sorted({bar.link.digest for bar in known.bars})

@@ -37,7 +37,7 @@ def camera_axes(*degrees: float) -> np.ndarray:
 
 def test_sites_and_camera_say_what_the_image_shows() -> None:
     simulation = Simulation(SCENE)
-    truth = truth_of(simulation).to_table()
+    truth = truth_of(simulation).table
     sites, path = sites_of(SCENE), truth["camera_path"]
     assert [s.transmitter_id for s in sites] == [1, 77, 3]
     camera = SCENE.camera
@@ -72,7 +72,7 @@ def test_clusters_that_are_not_in_line_stand_where_their_light_is(layout: dict[s
 
 def test_without_a_world_there_are_no_sites() -> None:
     scene = load_scene("drive-30kmh", ["duration_s=0.01"])
-    assert "sites" not in truth_of(Simulation(scene)).to_table()
+    assert "sites" not in truth_of(Simulation(scene)).table
     with pytest.raises(ConfigError, match=r"no \[world\]"):
         sites_of(scene)
 

@@ -60,10 +60,10 @@ COVERS |= {"cover_s": [[0.03, 0.06, 10, 15], [0.05, 0.052, 0, 3], [0.0, 0.3, 9, 
 
 def scene_truths() -> dict[str, Table]:
     two = truth_of(load_scene("two-bars", ["duration_s=0.2", "motion.distance_m=61.0", "t0_us=16777000"]))
-    dark, covered = plain(truth_of(Scene()).to_table()), plain(truth_of(load_scene("two-bars")).to_table())
+    dark, covered = plain(truth_of(Scene()).table), plain(truth_of(load_scene("two-bars")).table)
     dark["bars"][0]["led_w_m2"] = 1e-9
     covered["bars"][0] |= COVERS
-    return {"two": plain(two.to_table()), "dark": dark, "covered": covered}
+    return {"two": plain(two.table), "dark": dark, "covered": covered}
 
 
 @needs_tools
@@ -205,7 +205,7 @@ def test_of_two_bars_in_one_place_the_one_that_shows_is_meant() -> None:
 
 
 GOOD = ",".join(COLUMNS[:6]) + "\n"
-SCENE = json.dumps(truth_of(Scene(duration_s=0.05)).to_table())
+SCENE = json.dumps(truth_of(Scene(duration_s=0.05)).table)
 
 
 @pytest.mark.parametrize(
