@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
 from evlcp_sdk.files import read_json
 from evlcp_sdk.link.resolve import Link, resolve
@@ -65,21 +64,6 @@ class SentBar:
     def rate_hz(self) -> float:
         """Chips a second by the clock of the recording."""
         return self.link.air.chip_rate_hz * (1 + self.ppm * 1e-6)
-
-    @property
-    def packet(self) -> PacketFormat:
-        """Lengths of a packet's parts."""
-        return self.link.packet
-
-    @property
-    def clusters(self) -> int:
-        """Number of clusters K."""
-        return self.link.codebook.clusters
-
-    @property
-    def bits_per_symbol(self) -> int:
-        """Bits that one symbol carries."""
-        return self.link.codebook.bits_per_symbol
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,9 +33,10 @@ def test_a_truth_comes_back_from_its_file(tmp_path: Path) -> None:
         {"led_w_m2": 1e-9, "link": {"bar": {"rows": 48}}},
     ]
     known = truth_of(resolve_scene({"duration_s": 0.1, "t0_us": 5, "world": WORLD, "bars": bars}))
-    assert [(bar.payload, bar.lit, bar.clusters, bar.bits_per_symbol) for bar in known.bars] == [
-        *(("messages", True, 16, 6), ("symbols", True, 16, 4), ("symbols", False, 8, 6))
+    assert [(bar.payload, bar.lit, bar.link.codebook.clusters) for bar in known.bars] == [
+        *(("messages", True, 16), ("symbols", True, 16), ("symbols", False, 8))
     ]
+    assert [bar.link.codebook.bits_per_symbol for bar in known.bars] == [6, 4, 6]
     assert [bar.rate_hz for bar in known.bars] == pytest.approx([10_000.3, 5000.0, 10_000.0])
     assert len(known.sites) == 3
     path = tmp_path / "REC.truth.json"
