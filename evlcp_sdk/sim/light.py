@@ -18,7 +18,6 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.sim.leds import LitStrip, split_into_strips
-from evlcp_sdk.sim.motion import Strip
 from evlcp_sdk.sim.optics import led_light_w_m2
 from evlcp_sdk.sim.scene import (
     MAX_SOURCES,
@@ -31,7 +30,7 @@ from evlcp_sdk.sim.scene import (
     WiperSpec,
     links_of,
 )
-from evlcp_sdk.sim.world import bar_axis, bar_normal, bar_right, sites_of
+from evlcp_sdk.sim.world import bar_axes, sites_of
 
 Floats = NDArray[np.float64]
 
@@ -49,22 +48,37 @@ _SLAT_STEP_UM = 1000.0
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A strip of light that switches as a whole or part by part, or an image of one.
+    """A straight strip of light, cut into clusters that switch one by one; or a reflection of one.
 
     Attributes:
-        strip: The strip in the scene.
+        centre_m: Its middle in the scene, x, y, z, float64 (3,).
+        along_m: Vector from its first end to its last, float64 (3,).
+        width_m: Its width.
+        cuts: Where its clusters start and end, shares of its length from -0.5 to 0.5.
         light_w_m2: Irradiance of a pixel that it fills.
         longest_us: How long its full light may move a slow pixel the same way, us.
         switches: Takes two times, us, and returns the times of switching between them, float64 (n,), and the
-            levels from 0 to 1 from the first time and from each of these on, float64 (n + 1, parts).
+            levels from 0 to 1 from the first time and from each of these on, float64 (n + 1, clusters).
         image: The reflection that shows it; None for the direct view.
     """
 
-    strip: Strip
+    centre_m: Floats
+    along_m: Floats
+    width_m: float
+    cuts: tuple[float, ...]
     light_w_m2: float
     longest_us: float
     switches: Callable[[float, float], tuple[Floats, Floats]]
     image: ReflectionSpec | None = None
+
+    @property
+    def clusters(self) -> int:
+        """Number of its clusters."""
+        return len(self.cuts) - 1
+
+    def cuts_m(self) -> Floats:
+        """Return where its clusters start and end, float64 (clusters + 1, 3)."""
+        return self.centre_m + np.array(self.cuts)[:, None] * self.along_m
 
 
 def cut_changes(when_us: Floats, held: Floats, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
@@ -155,7 +169,7 @@ class BarLight:
 
     def _make_source(self, lit: LitStrip, share: float, image: ReflectionSpec | None = None) -> Source:
         """Place a strip of the layout in the scene, with its share of the light, or its reflection."""
-        axes = np.stack([bar_right(self.bar), bar_axis(self.bar), bar_normal(self.bar)])
+        axes = bar_axes(self.bar)
         centre_m = np.array(self.centre_m) + np.array(lit.centre_m) @ axes
         along_m = lit.length_m * axes[int(lit.is_vertical)]
         if image is not None:
@@ -163,7 +177,7 @@ class BarLight:
             if image.kind != "window":
                 plane_m, axis = self.centre_m[0], 0
                 if image.kind == "road":
-                    plane_m, axis = max(one.strip.cuts_m()[[0, -1], 1].max() for one in self.strips), 1
+                    plane_m, axis = max(one.cuts_m()[[0, -1], 1].max() for one in self.strips), 1
                 plane_m += 0.5 * image.gap_m
                 centre_m[axis], along_m[axis] = 2 * plane_m - centre_m[axis], -along_m[axis]
 
@@ -172,8 +186,8 @@ class BarLight:
             shown = levels[:, lit.clusters] * lit.switched + lit.constant
             return (when, shown) if image else self.hide_clusters(when, shown, begin_us, end_us, lit)
 
-        strip = Strip(centre_m, along_m, lit.width_m, lit.cuts)
-        return Source(strip, self.light_w_m2 * share, self.longest_us, switches, image)
+        light_w_m2 = self.light_w_m2 * share
+        return Source(centre_m, along_m, lit.width_m, lit.cuts, light_w_m2, self.longest_us, switches, image)
 
     def _check_covers(self, source: str) -> tuple[tuple[float, float, int, int], ...]:
         """Return what hides clusters for a time: (from us, to us, first cluster, last cluster)."""
@@ -347,8 +361,9 @@ def make_lamp_source(lamp: LampSpec) -> Source:
         held = np.append(levels[-1], np.tile(levels, len(periods)))
         return cut_changes(when, held[:, None], begin_us, end_us)
 
-    strip = Strip((lamp.x_m, lamp.y_m, lamp.z_m), (0, lamp.height_m, 0), lamp.width_m, (-0.5, 0.5))
-    return Source(strip, lamp.light_w_m2, 1e6 / lamp.flicker_hz, switches)
+    centre_m, along_m = np.array([lamp.x_m, lamp.y_m, lamp.z_m]), np.array([0.0, lamp.height_m, 0.0])
+    period_us = 1e6 / lamp.flicker_hz
+    return Source(centre_m, along_m, lamp.width_m, (-0.5, 0.5), lamp.light_w_m2, period_us, switches)
 
 
 def wiper_switches(wiper: WiperSpec, begin_us: float, end_us: float) -> tuple[Floats, Floats]:

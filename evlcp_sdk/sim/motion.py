@@ -1,4 +1,4 @@
-"""Move the camera, and project strips of light into its image."""
+"""Move the camera, and project points into its image."""
 
 import math
 from dataclasses import dataclass
@@ -125,33 +125,6 @@ def _read_path(path: Path, duration_s: float) -> CubicSpline:
             f"{path}: lasts from {table[0, 0]} to {table[-1, 0]} s, the scene to {duration_s} s"
         )
     return CubicSpline(table[:, 0], table[:, 1:])
-
-
-@dataclass(frozen=True, eq=False)
-class Strip:
-    """A straight strip of light in the scene, cut into clusters from its first end.
-
-    Attributes:
-        centre_m: x, y, z of its middle.
-        along_m: Vector from its first end to its last.
-        width_m: Its width.
-        cuts: Where its clusters start and end, shares of its length from -0.5 to 0.5.
-    """
-
-    centre_m: ArrayLike
-    along_m: ArrayLike
-    width_m: float
-    cuts: tuple[float, ...]
-
-    @property
-    def clusters(self) -> int:
-        """Number of its clusters."""
-        return len(self.cuts) - 1
-
-    def cuts_m(self) -> Floats:
-        """Return where its clusters start and end, float64 (clusters + 1, 3)."""
-        cuts: Floats = np.asarray(self.centre_m) + np.array(self.cuts)[:, None] * np.asarray(self.along_m)
-        return cuts
 
 
 def project(

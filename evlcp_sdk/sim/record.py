@@ -145,7 +145,7 @@ def _locate_reflections(simulation: Simulation, position: Floats, attitude: Floa
         for j, reflection in enumerate(reflections_of(simulation.scene, i)):
             images = light.images[j * columns : (j + 1) * columns]
             # The centre of a bar is the mean of its columns' centres.
-            strips = [replace(image, strip=replace(image.strip, cuts=(-0.5, 0.0, 0.5))) for image in images]
+            strips = [replace(image, cuts=(-0.5, 0.0, 0.5)) for image in images]
             place = np.mean(
                 [simulation.project_source(strip, position, attitude)[0][:, 1] for strip in strips], 0
             )

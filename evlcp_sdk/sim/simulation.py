@@ -343,7 +343,7 @@ class Simulation:
         self._model = _kernels.PixelModel(seed_key(scene.seed), pack_sensor(scene.sensor), quantiles, shifts)
         self._texture = _draw_texture(scene)
         self._darkest_texture = float(self._texture.min())
-        self._ends_m = np.array([s.strip.cuts_m()[[0, -1]] for s in self._sources]).reshape(-1, 3)
+        self._ends_m = np.array([s.cuts_m()[[0, -1]] for s in self._sources]).reshape(-1, 3)
         size = scene.camera.width * scene.camera.height
         self._state = np.zeros((size, 8))
         self._counters = np.zeros((size, 3), np.int64)
@@ -544,7 +544,7 @@ class Simulation:
             if depth.min() <= NEAREST_M:
                 continue
             middle_depth = depth.mean(1)
-            strip_px = camera.focal_px * source.strip.width_m / middle_depth
+            strip_px = camera.focal_px * source.width_m / middle_depth
             vector = place[:, -1] - place[:, 0]
             axis = vector / np.hypot(*vector.T)[:, None]
             bounds = ((place - place[:, :1]) * axis[:, None]).sum(-1)
@@ -571,7 +571,7 @@ class Simulation:
             pixels, masks, far = self._add_background(pixels, masks, far, [one[2] for one in shown])
 
         g, poses = len(shown), len(starts)
-        most = max((source.strip.clusters for source, *_ in shown), default=1)
+        most = max((source.clusters for source, *_ in shown), default=1)
         origin, axis = np.empty((2, g, poses)), np.empty((2, g, poses))
         bounds, strips = np.zeros((g, most + 1, poses)), np.empty((g, poses))
         clusters, gain = np.empty(g, np.int64), np.empty(g)
@@ -581,7 +581,7 @@ class Simulation:
         levels_of: list[Floats] = []
         halos_of: list[list[Floats]] = [[] for _ in self._halos]
         for i, (source, sent, place, strip_px, along, cuts, footprint) in enumerate(shown):
-            k = source.strip.clusters
+            k = source.clusters
             axis[:, i] = along.T
             origin[:, i] = place[:, 0].T
             bounds[i, : k + 1] = cuts.T
@@ -609,11 +609,11 @@ class Simulation:
         """Project the cuts between a source's clusters into the image, with their depths; see `project`."""
         image = source.image
         if image is None or image.kind != "window":
-            return project(source.strip.cuts_m(), position, attitude, self.scene.camera)
+            return project(source.cuts_m(), position, attitude, self.scene.camera)
         # Light from further right is light for a camera turned further left.
         right, down = map(math.radians, image.turn_deg)
         turned = attitude + np.array([-right, down, 0.0])
-        place, depth = project(source.strip.cuts_m(), position, turned, self.scene.camera)
+        place, depth = project(source.cuts_m(), position, turned, self.scene.camera)
         return place + np.array(image.shift_px), depth
 
     def _add_background(

@@ -23,22 +23,12 @@ from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec, links_of
 Floats = NDArray[np.float64]
 
 
-def bar_axis(bar: BarSpec) -> tuple[float, float, float]:
-    """Return the unit vector from a bar's top to its bottom in the scene's axes."""
+def bar_axes(bar: BarSpec) -> Floats:
+    """Return the unit vectors to a bar's right, to its bottom and out of its front in the scene's axes."""
     lean, tilt = math.radians(bar.lean_deg), math.radians(bar.tilt_deg)
-    return -math.sin(lean) * math.cos(tilt), math.cos(lean) * math.cos(tilt), -math.sin(tilt)
-
-
-def bar_right(bar: BarSpec) -> tuple[float, float, float]:
-    """Return the unit vector from the left of a bar to its right in the scene's axes."""
-    lean = math.radians(bar.lean_deg)
-    return math.cos(lean), math.sin(lean), 0.0
-
-
-def bar_normal(bar: BarSpec) -> tuple[float, float, float]:
-    """Return the unit vector out of a bar's front in the scene's axes."""
-    x, y, z = np.cross(bar_axis(bar), bar_right(bar)).tolist()
-    return x, y, z
+    right = math.cos(lean), math.sin(lean), 0.0
+    down = -math.sin(lean) * math.cos(tilt), math.cos(lean) * math.cos(tilt), -math.sin(tilt)
+    return np.stack([right, down, np.cross(down, right)])
 
 
 def scene_to_enu(vectors: Floats, heading_deg: float) -> Floats:
@@ -66,9 +56,10 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
         latitude, longitude, height = axes.to_geodetic(
             scene_to_enu(np.array([bar.x_m, bar.y_m, bar.z_m]), world.heading_deg)
         )
-        east, north, _ = scene_to_enu(np.array(bar_normal(bar)), world.heading_deg)
+        _, down, front = scene_to_enu(bar_axes(bar), world.heading_deg)
+        east, north, _ = front
         facing = math.degrees(math.atan2(east, north)) % 360
-        east, north, up = -scene_to_enu(np.array(bar_axis(bar)), world.heading_deg)
+        east, north, up = -down
         level = math.hypot(east, north)
         # A vertical bar has no heading.
         heading = math.degrees(math.atan2(east, north)) % 360 if level > 1e-9 else 0.0

@@ -47,9 +47,9 @@ def test_sites_and_camera_say_what_the_image_shows() -> None:
         position, attitude = simulation.path.sample(truth["t_s"][i] * 1e6)
         for site, light in zip(sites, simulation.bars, strict=True):
             seen = camera.project(site.cluster_positions_m(16, local) @ axes.T)
-            strip = light.strips[0].strip
+            strip = light.strips[0]
             parts = (np.arange(16) + 0.5) / 16 - 0.5
-            ends = np.array(strip.centre_m) + parts[:, None] * np.array(strip.along_m)
+            ends = strip.centre_m + parts[:, None] * strip.along_m
             places, _ = project(ends, position, attitude, camera)
             # A level plane is level at its origin only: 50 m away the earth has turned by 8 urad.
             np.testing.assert_allclose(seen, places[0], atol=0.15)
@@ -64,7 +64,7 @@ def test_clusters_that_are_not_in_line_stand_where_their_light_is(layout: dict[s
     (site,), (light,) = sites_of(scene), Simulation(scene).bars
     found = site.layout_positions_m(light.link.bar, LocalAxes(35.1, 137.2, 40.0))
     for lit, strip in zip(split_into_strips(light.bar, light.link.bar), light.strips, strict=True):
-        cuts = strip.strip.cuts_m()
+        cuts = strip.cuts_m()
         for k, middle in zip(lit.clusters, (cuts[1:] + cuts[:-1]) / 2, strict=True):
             if k >= 0:
                 np.testing.assert_allclose(found[k], scene_to_enu(middle, 30.0), atol=1e-5)
