@@ -7,6 +7,7 @@ number is an engineering guess, its description says so.
 
 import json
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib import resources
@@ -544,7 +545,7 @@ def resolve_scene(
         _resolve_link(default, registry, f"{prefix}link")
     bars = table.get("bars")
     for i, bar in enumerate(bars if isinstance(bars, list) else []):
-        if isinstance(bar, dict) and isinstance(bar.get("link"), _FileLink):
+        if isinstance(bar, dict) and isinstance(bar.get("link"), Mapping):
             _resolve_link(bar["link"], registry, f"{prefix}bars.{i}.link")
     try:
         scene = build_spec(Scene, table, hint=_hint_at_link)
@@ -559,21 +560,19 @@ def resolve_scene(
             replace(bar, chips_file=bar.chips_file and str(folder / bar.chips_file)) for bar in scene.bars
         )
         scene = replace(scene, bars=tuple(bars), motion=replace(scene.motion, path_file=path))
-    links_of(scene, registry, source=source)
     return scene
 
 
-def links_of(scene: Scene, registry: Registry | None = None, *, source: str = "") -> tuple[Link, ...]:
-    """Return the resolved link of each bar of a scene, called `source` in error messages.
+def links_of(scene: Scene, registry: Registry | None = None) -> tuple[Link, ...]:
+    """Return the resolved link of each bar of a scene.
 
     Raises:
         ConfigError: A bar's link is not valid; one line per fault.
     """
-    prefix = f"{source}: " if source else ""
     table: dict[str, Any] = {"link": scene.link, "bars": [{"link": bar.link} for bar in scene.bars]}
-    _distribute_links(table, None, prefix)
+    _distribute_links(table, None, "")
     return tuple(
-        _resolve_link(bar.get("link") or {}, registry, f"{prefix}bars.{i}.link")
+        _resolve_link(bar.get("link") or {}, registry, f"bars.{i}.link")
         for i, bar in enumerate(table["bars"])
     )
 
@@ -691,15 +690,11 @@ def _parse_override(text: str) -> tuple[str, Any]:
 
 
 def _set_value(table: dict[str, Any], key: str, value: Any) -> None:
-    if isinstance(value, np.generic):
-        value = value.item()
-    head, *rest = key.split(".")
+    head, *rest = parts = key.split(".")
+    if rest and head not in (*_TABLES, *_LISTS, "link"):
+        raise ConfigError(f"--set {key}: unknown table{suggest(head, [*_TABLES, *_LISTS, 'link'])}")
     holders = [table]
-    if not rest or head == "link":
-        rest = [head, *rest]
-    elif head in _TABLES:
-        holders = [table.setdefault(head, {})]
-    elif head in _LISTS:
+    if rest and head in _LISTS:
         holders = rows = table.setdefault(head, [{}])
         if len(rest) > 1 and (head, rest[0]) != ("bars", "link"):
             number, *rest = rest
@@ -708,25 +703,19 @@ def _set_value(table: dict[str, Any], key: str, value: Any) -> None:
                     f"--set {key}: expected one of {format_count(len(rows), head[:-1])}, from 0 on"
                 )
             holders = [rows[int(number)]]
+        parts = rest
+    if len(parts) > (3 if parts[0] == "link" else 1 if parts is rest else 2):
+        raise ConfigError(f"--set {key}: expected table.key, or link.TABLE.KEY, e.g. link.air.chip_rate_hz")
     for holder in holders:
-        if rest[0] == "link" and len(rest) > 1 and head in ("link", "bars"):
-            _set_link_value(holder, rest[1:], value, key)
-        elif len(rest) == 1 and head in (key, *_TABLES, *_LISTS):
-            holder[rest[0]] = value
-        else:
-            raise ConfigError(f"--set {key}: unknown table{suggest(head, [*_TABLES, *_LISTS, 'link'])}")
+        _set_at(holder, parts, value.item() if isinstance(value, np.generic) else value)
 
 
-def _set_link_value(holder: dict[str, Any], parts: Sequence[str], value: Any, key: str) -> None:
-    if len(parts) > 2:
-        raise ConfigError(f"--set {key}: expected link.TABLE.KEY, e.g. link.air.chip_rate_hz")
-    link = holder.get("link")
-    if not isinstance(link, dict):
-        link = holder["link"] = {}
-    if len(parts) == 1:
-        link[parts[0]] = value
-        return
-    keys = link.get(parts[0])
-    link[parts[0]] = {**keys, parts[1]: value} if isinstance(keys, Mapping) else {parts[1]: value}
-    if parts == ["bar", "leds_file"]:
-        link["bar"].pop("leds", None)
+def _set_at(holder: dict[str, Any], parts: Sequence[str], value: Any) -> None:
+    """Set a value in a table, by the names of the tables in it on the way, which are copied."""
+    *tables, last = parts
+    for name in tables:
+        holder[name] = copy(holder[name]) if isinstance(holder.get(name), dict) else {}
+        holder = holder[name]
+    holder[last] = value
+    if tables[-1:] == ["bar"] and last == "leds_file":
+        holder.pop("leds", None)
