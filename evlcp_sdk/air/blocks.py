@@ -5,6 +5,7 @@ import zlib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import islice
 
 from evlcp_sdk.errors import ConfigError, EvlcpError
 
@@ -23,8 +24,8 @@ _CRC = struct.Struct("<I")
 HEADER_BYTES = _HEADER.size
 """Bytes of a block's header."""
 
-_WHITE_SEED = 2463534242
-"""Start of the whitening if the header's CRC is 0, where xorshift32 would stay."""
+XORSHIFT_SEED = 2463534242
+"""Marsaglia's seed of xorshift32; also of the whitening if the header's CRC is 0, where that would stay."""
 
 _LARGEST_NUMBER = 0xFFFFFFFF
 _MAX_PARTS = 0x10000
@@ -170,18 +171,26 @@ class Block:
 def _whiten(head: bytes, body: bytes) -> bytes:
     """The bytes after a header, XORed with the numbers of an xorshift32 that starts with the header's CRC-32.
 
-    The numbers are those of Marsaglia 2003 (shifts 13, 17, 5), four bytes each, least significant first. So
-    equal bytes do not make equal symbols, a light that repeats itself frame by frame; and two blocks with
-    different headers differ in half their bits on air, so that a receiver recognises packets of the same one.
+    The numbers are four bytes each, least significant first. So equal bytes do not make equal symbols, a
+    light that repeats itself frame by frame; and two blocks with different headers differ in half their bits
+    on air, so that a receiver recognises packets of the same one.
     """
-    x = zlib.crc32(head) or _WHITE_SEED
-    stream = bytearray()
-    while len(stream) < len(body):
+    numbers = islice(iterate_xorshift32(zlib.crc32(head) or XORSHIFT_SEED), -(-len(body) // 4))
+    stream = b"".join(number.to_bytes(4, "little") for number in numbers)
+    return bytes(a ^ b for a, b in zip(body, stream, strict=False))
+
+
+def iterate_xorshift32(x: int) -> Iterator[int]:
+    """The numbers of the generator xorshift32 (Marsaglia 2003, shifts 13, 17, 5) after `x`, without end.
+
+    >>> next(iterate_xorshift32(XORSHIFT_SEED))
+    723471715
+    """
+    while True:
         x ^= x << 13 & 0xFFFFFFFF
         x ^= x >> 17
         x ^= x << 5 & 0xFFFFFFFF
-        stream += x.to_bytes(4, "little")
-    return bytes(a ^ b for a, b in zip(body, stream, strict=False))
+        yield x
 
 
 def total_bytes(length: int, room: int) -> int:

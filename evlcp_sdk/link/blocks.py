@@ -5,14 +5,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.blocks import DIGEST_BYTES, HEADER_BYTES
+from evlcp_sdk.air.blocks import DIGEST_BYTES, HEADER_BYTES, XORSHIFT_SEED, iterate_xorshift32
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, symbols_of_bits
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Code, Corrected
-
-_SEED = 2463534242
-"""Seed of the interleaver's sequence, Marsaglia's own."""
 
 
 def packet_bits(codebook: Codebook, packet: PacketFormat) -> int:
@@ -23,21 +20,15 @@ def packet_bits(codebook: Codebook, packet: PacketFormat) -> int:
 def interleaver_order(bits: int) -> NDArray[np.int64]:
     """Place on air of each coded bit, int64 (bits,): the places 0, 1, ... sorted by random numbers.
 
-    The numbers are those of the generator xorshift32 (Marsaglia 2003, shifts 13, 17, 5), one a place. A lost
-    cluster or frame then takes bits from the whole code. A regular order, such as multiples of the golden
-    ratio, spreads them more evenly, but suits a polar code badly, whose own order is as regular.
+    The numbers are those of xorshift32, one a place. A lost cluster or frame then takes bits from the whole
+    code. A regular order, such as multiples of the golden ratio, spreads them more evenly, but suits a polar
+    code badly, whose own order is as regular.
 
     >>> interleaver_order(10).tolist()
     [5, 7, 0, 8, 6, 3, 2, 1, 9, 4]
     """
-    numbers = []
-    x = _SEED
-    for _ in range(bits):
-        x ^= x << 13 & 0xFFFFFFFF
-        x ^= x >> 17
-        x ^= x << 5 & 0xFFFFFFFF
-        numbers.append(x)
-    return np.argsort(np.array(numbers, np.int64), kind="stable")
+    numbers = np.fromiter(iterate_xorshift32(XORSHIFT_SEED), np.int64, bits)
+    return np.argsort(numbers, kind="stable")
 
 
 class BlockCoder:
