@@ -18,8 +18,9 @@ import numpy as np
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.scene.bar import BarLayout, LedTable
 from firmware_host import build
-from firmware_host.board.bank import Bank, random_symbols
+from firmware_host.board.bank import Bank, make_bank, random_packets
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.emulators.simulated import SimulatedBoard
@@ -40,8 +41,7 @@ STREAMED = 200
 def program() -> None:
     """64 packets behind a USB bridge against the time that their bytes take, by the board's clock."""
     link = load_link()
-    symbols = random_symbols(64, 10, link.codebook, np.random.default_rng(0))
-    bank = Bank.of_symbols(symbols, link.codebook)
+    bank = make_bank(random_packets(64, link, 0), link)
     board = SimulatedBoard()
     with Session(UsbLine(board, 0.002, BAUD, 0.001), Timing(BAUD)) as session:
         provision(Board(session), bank, Settings())
@@ -81,15 +81,14 @@ def stm32() -> None:
         "crystal stops": lambda chip: chip.stop_crystal(),
         "supply falls": lambda chip: chip.pending.add(16 + 1),
     }
-    book = load_link().codebook
+    link = load_link(overrides=["air.frames_per_packet=4"])
     print("\n| fault at a random moment | dark after, chips at most |\n|---|---|")
     for name, fail in breaks.items():
         late_us = []
         for moment in range(12):
-            rng = np.random.default_rng(moment)
             chip, board = model()
-            provision(board, Bank.of_symbols(random_symbols(1, 4, book, rng), book), Settings())
-            chip.run(5_000 + float(rng.uniform(0, 1_000)))
+            provision(board, make_bank(random_packets(1, link, moment), link), Settings())
+            chip.run(5_000 + float(np.random.default_rng(moment).uniform(0, 1_000)))
             at = chip.now
             fail(chip)
             chip.run(1_000)
@@ -100,17 +99,19 @@ def stm32() -> None:
 
 def full_banks() -> dict[str, Bank]:
     """A bank of each kind, as full as it gets; every chip that is lit lights every LED."""
-    book = load_link().codebook
-    found = {"words": Bank.of_symbols(random_symbols(128, 10, book, np.random.default_rng(1)), book)}
+    link = load_link()
+    found = {"words": make_bank(random_packets(128, link, 1), link)}
     for clusters in (1, 10, 16, 88, 96):
         drawn = np.random.default_rng(1).integers(0, 2, (clusters + 2, 48), dtype=np.uint8)
-        own = Codebook("drawn", book.preamble, drawn[:-2], drawn[-2:])
+        own = Codebook("drawn", link.codebook.preamble, drawn[:-2], drawn[-2:])
         row = -(-clusters // 8)
         most = (40_960 - (12 * clusters if row < 12 else 0)) // row
         packet = replace(PacketFormat.of(own, 1), preamble_chips=most - 96)
         light = np.tile(np.array([[1], [0]], np.uint8), (most, clusters))[:most]
         name = f"{clusters} clusters" if row < 12 else "masks of each LED"
-        found[name] = Bank.of_chips(light, own, packet, np.arange(96) * clusters // 96)
+        leds = tuple((0.0, n / 100, 0.0, n * clusters // 96) for n in range(96))
+        bar = BarLayout(LedTable(leds))
+        found[name] = Bank.of_chips(light, replace(link, codebook=own, packet=packet, bar=bar))
     return found
 
 
@@ -144,7 +145,7 @@ def stream() -> None:
 def measure_stream(latency_s: float, ahead: int, pause_s: float, packets: int = STREAMED) -> Measured:
     """Stream packets, each `pause_s` after the one before has gone out; the board has virtual time."""
     link, device = load_link(), SimulatedBoard()
-    symbols = random_symbols(packets, link.packet.frames, link.codebook, np.random.default_rng(0))
+    symbols = random_packets(packets, link, 0)
     session = Session(UsbLine(device, latency_s, frame_s=1e-3), Timing(), first=1, nonce=1)
     calls = []
     with Board(session).stream(link, ahead) as streamed:

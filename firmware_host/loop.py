@@ -95,7 +95,7 @@ def light_of(symbols: ArrayLike, link: Link, chips: int, trace: Path | None = No
         device.run(math.ceil(chips / link.air.chip_rate_hz * 1e6) + 1000)
         info = board.info
         record = device.take_led_record().select_chips()
-    expected = symbol_chips(symbols, link.codebook, link.packet.pilot_every)
+    expected = symbol_chips(symbols, link)
     played = record.chips(link.bar.led_clusters())
     differ = played != expected[np.arange(len(played)) % len(expected)]
     if len(played) < chips or differ.any():

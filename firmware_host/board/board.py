@@ -225,12 +225,12 @@ class Board:
         if not bank.composed:
             clusters = bank.clusters if bank.format == Format.CLUSTERS else 0
             request = protocol.ChipsRequest(
-                bank.packet.packet_chips, self._hold_count(bank), clusters, digest
+                bank.link.packet.packet_chips, self._hold_count(bank), clusters, digest
             )
             self.session.call(request)
             return
-        pilots = tuple(map(word_of_chips, bank.codebook.pilots))
-        preamble = (bank.packet.preamble_chips, word_of_chips(bank.codebook.preamble))
+        pilots = tuple(map(word_of_chips, bank.link.codebook.pilots))
+        preamble = (bank.link.packet.preamble_chips, word_of_chips(bank.link.codebook.preamble))
         self.session.call(protocol.CodebookRequest(*preamble, pilots, digest))
 
     def _hold_count(self, bank: Bank) -> int:
@@ -252,7 +252,7 @@ class Board:
 
     def _configure(self, bank: Bank, level_limit_ma: int = 0, duty_limit: int = 0) -> None:
         info, rate = self.info, bank.chip_rate_hz * self._hold_count(bank)
-        packet = (bank.packet.frames, bank.packet.pilot_every) if bank.composed else (1, 1)
+        packet = (bank.link.packet.frames, bank.link.packet.pilot_every) if bank.composed else (1, 1)
         limits = (level_limit_ma, duty_limit)
         try:
             self.session.call(protocol.ConfigureRequest(rate, profile_number(bank), *packet, *limits))
@@ -277,7 +277,7 @@ class Board:
 
     def _find_difference(self, bank: Bank, status: protocol.StatusReply) -> str | None:
         """The first difference between the active bank in STATUS and this one, but for the CRC."""
-        packet, hold = bank.packet, self._hold_count(bank)
+        packet, hold = bank.link.packet, self._hold_count(bank)
         expected: dict[str, object] = {
             "format": bank.format,
             "packets": bank.packets,
@@ -405,8 +405,9 @@ class Board:
         if (book, rate_hz) != (bank.digest, bank.chip_rate_hz):
             raise IncompatibleError(
                 f"{self.session.name}: plays codebook {book[:16]} at {rate_hz} chips per second,"
-                f" this payload's link has {bank.digest[:16]} ({bank.codebook.profile}) at air.chip_rate_hz ="
-                f" {bank.chip_rate_hz}; give its link with -c or --set, or 'evlcp board program' to change it"
+                f" this payload's link has {bank.digest[:16]} ({bank.link.codebook.profile}) at"
+                f" air.chip_rate_hz = {bank.chip_rate_hz}; give its link with -c or --set, or 'evlcp board"
+                " program' to change it"
             )
 
     def verify(self, bank: Bank) -> int:
@@ -443,7 +444,7 @@ class Board:
         Raises:
             IncompatibleError: Its firmware does not play such links.
         """
-        info, name, leds = self.info, self.session.name, len(bank.led_clusters)
+        info, name, leds = self.info, self.session.name, len(bank.link.bar.led_clusters())
         if leds > info.leds:
             raise ConfigError(f"a link of {leds} LEDs, {name} has {info.leds}: HELLO says so")
         if bank.composed and (info.leds, info.clusters) != (LEDS, CLUSTERS):

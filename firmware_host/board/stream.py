@@ -69,7 +69,7 @@ class Stream:
         self._pulse_s = pulse_s
         self._pause_packet = None
         if template.rest is not None:
-            shape = (template.packet.packet_chips, template.clusters)
+            shape = (template.link.packet.packet_chips, template.clusters)
             self._pause_packet = template.encode(np.full(shape, template.rest, np.uint8))
         self._piece_bytes = session.max_payload - _PIECE_OVERHEAD
         self._retries = session.client.retries
@@ -77,7 +77,7 @@ class Stream:
         self._pieces: list[_Piece] = []
         self._in_flight: dict[int, tuple[_Piece | None, PushRequest]] = {}
         self._position = (0, 0)
-        self.packet_s = template.packet.packet_chips / template.chip_rate_hz
+        self.packet_s = template.link.packet.packet_chips / template.chip_rate_hz
         self._last_reply_s = session.transport.time_s()
         self._blocked_until_s = self._last_reply_s
         # latest possible start of the newest packet that has begun; the first begins at once
@@ -151,10 +151,10 @@ class Stream:
             ConfigError: The symbols are not a packet of the link.
         """
         packet, template = np.asarray(symbols), self._template
-        shape = (template.packet.frames, template.clusters)
+        shape = (template.link.packet.frames, template.clusters)
         if packet.shape != shape:
             raise ConfigError(f"symbols of shape {packet.shape}, expected {shape}: frames, clusters")
-        chips = packet_chips(packet, template.codebook, template.packet.pilot_every)
+        chips = packet_chips(packet, template.link.codebook, template.link.packet.pilot_every)
         number = self._queue_packet(template.encode(chips))
         self.sent += 1
         while self._pieces and self._pieces[0].number <= number:

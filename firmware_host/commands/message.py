@@ -221,7 +221,7 @@ def _write_files(
 
     with Outputs() as outputs:
         if chips is not None:
-            outputs.write_array(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chips)
+            outputs.write_array(symbol_chips(symbols, link), chips)
         if out is not None:
             outputs.write_text(json.dumps(table) + "\n", out)
         outputs.commit()

@@ -53,7 +53,7 @@ def frames(
         from firmware_host.board.bank import symbol_chips
 
         with Outputs() as outputs:
-            outputs.write_array(symbol_chips(table, link.codebook, link.packet.pilot_every), chips)
+            outputs.write_array(symbol_chips(table, link), chips)
             outputs.commit()
     echo(_FORMATTERS[form](table, link))
 
@@ -147,7 +147,7 @@ def check(*, sent: SymbolOptions, as_json: AsJson = False) -> None:
 
     symbols, link = sent.load()
     chip_rate = link.packet.chip_rate_hz
-    rows = measure_flicker(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chip_rate)
+    rows = measure_flicker(symbol_chips(symbols, link), chip_rate)
     if as_json:
         print_json({"chip_rate_hz": chip_rate, "clusters": [r.to_dict() for r in rows]})
     else:

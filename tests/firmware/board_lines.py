@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.link.resolve import load_link
-from firmware_host.board.bank import make_bank, random_symbols, symbol_chips
+from firmware_host.board.bank import make_bank, random_packets, symbol_chips
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.emulators.listening import HostLine
@@ -48,7 +48,7 @@ def options_of(*overrides):
 
 def symbols_of(packets, seed=0, link=LINK):
     """Random symbols of packets of a link."""
-    return random_symbols(packets, link.packet.frames, link.codebook, np.random.default_rng(seed))
+    return random_packets(packets, link, seed)
 
 
 def some_bank(packets=1, seed=0, link=LINK):
@@ -189,7 +189,7 @@ def packet_sequence(played, payloads):
     """Name and packet number of every whole packet that was played; fails on one that is none of them."""
     known = {}
     for name, symbols in payloads.items():
-        for p, packet in enumerate(np.split(symbol_chips(symbols, LINK.codebook), len(symbols))):
+        for p, packet in enumerate(np.split(symbol_chips(symbols, LINK), len(symbols))):
             known[packet.tobytes()] = (name, p)
     assert len(known) == sum(len(s) for s in payloads.values())
     chips = played.chips()

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from board_lines import (
+    LINK,
     board_link,
     board_on,
     check_fault,
@@ -20,7 +21,8 @@ from hypothesis import given, settings, strategies as st
 from evlcp_sdk.air.codebook import Codebook, hadamard
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError
-from firmware_host.board.bank import Bank, make_bank, random_symbols, symbol_chips
+from evlcp_sdk.scene.bar import BarLayout, LedTable
+from firmware_host.board.bank import Bank, make_bank, random_packets, symbol_chips
 from firmware_host.board.board import Settings, profile_number, provision
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import IncompatibleError, RefusedError
@@ -42,11 +44,20 @@ def book_of(clusters, values):
 
 
 BOOK = book_of(10, 12)
-SYMBOLS = random_symbols(2, 3, BOOK, np.random.default_rng(1))
+
+
+def link_of(book, packet, led_clusters=LED_CLUSTERS):
+    """A link with codes, a packet and LEDs of one's own."""
+    leds = tuple((0.0, i / 100, 0.0, int(cluster)) for i, cluster in enumerate(led_clusters))
+    return replace(LINK, codebook=book, packet=packet, bar=BarLayout(LedTable(leds)))
+
+
+DRAWN = link_of(BOOK, PacketFormat.of(BOOK, 3, pilot_every=2))
+SYMBOLS = random_packets(2, DRAWN, 1)
 
 
 def a_bank(**changes):
-    return Bank.of_symbols(SYMBOLS, BOOK, 2, led_clusters=LED_CLUSTERS, **changes)
+    return make_bank(SYMBOLS, replace(DRAWN, packet=replace(DRAWN.packet, **changes)))
 
 
 def leds_of(chips, led_clusters):
@@ -65,7 +76,7 @@ def check_round(rows, expected, least):
     assert not rows[:, leds:].any()
 
 
-EXPECTED = leds_of(symbol_chips(SYMBOLS, BOOK, 2), LED_CLUSTERS)
+EXPECTED = leds_of(symbol_chips(SYMBOLS, DRAWN), LED_CLUSTERS)
 """80 chips of preamble, two pilots and three words of 24: twice."""
 
 
@@ -81,7 +92,7 @@ def check_plays(device, board, bank, leds):
     assert (np.diff(record.ticks) == device.TICK_HZ // bank.chip_rate_hz).all()
     status = board.status()
     assert status.duty == bank.duty == share
-    assert (status.packet_chips, status.faults) == (bank.packet.packet_chips, 0)
+    assert (status.packet_chips, status.faults) == (bank.link.packet.packet_chips, 0)
     assert board.verify(bank) == status.active_bank
     assert provision(board, bank, Settings()).written == 0
 
@@ -120,17 +131,18 @@ def test_every_led_does_what_it_is_sent(device, board, form, overrides):
             stream.send(packet)
     rows = shown_chips(device)
     assert (rows[-len(leds) :] == leds).all()
-    assert not rows[:, len(bank.led_clusters) :].any()
+    assert not rows[:, len(link.bar.led_clusters()) :].any()
     assert board.status().faults == 0
 
 
 def test_own_codes_are_composed_too(device, board):
     rows, values = hadamard(8), np.array([1, 1, 1, -1, 1], np.int8)
     book = Codebook.of_values("wh8", values, np.concatenate([-rows, rows]), rows)
-    symbols = random_symbols(2, 3, book, np.random.default_rng(0))
-    bank = Bank.of_symbols(symbols, book)
+    link = replace(LINK, codebook=book, packet=PacketFormat.of(book, 3))
+    symbols = random_packets(2, link, 0)
+    bank = make_bank(symbols, link)
     assert (bank.format, profile_number(bank)) == (Format.WORDS, Profile.CUSTOM)
-    check_plays(device, board, bank, np.repeat(symbol_chips(symbols, book), 6, axis=1))
+    check_plays(device, board, bank, np.repeat(symbol_chips(symbols, link), 6, axis=1))
 
 
 @given(st.data())
@@ -146,7 +158,7 @@ def test_any_clusters_of_any_leds(data):
     packet = replace(PacketFormat.of(book_of(clusters, 8), 1), preamble_chips=data.draw(st.integers(1, 40)))
     packets = data.draw(st.integers(1, 5))
     chips = rng.integers(0, 2, (packets * packet.packet_chips, clusters), dtype=np.uint8)
-    bank = Bank.of_chips(chips, book_of(clusters, 8), packet, which)
+    bank = Bank.of_chips(chips, link_of(book_of(clusters, 8), packet, which))
     assert bank.format == (Format.CLUSTERS if clusters <= 88 else Format.MASKS)
     provision(board, bank, Settings())
     device.run(data.draw(st.integers(1, 400)) * 100)
@@ -159,7 +171,7 @@ def test_any_clusters_of_any_leds(data):
 def test_idle_keeps_to_the_limits(device, board, limit, every):
     """LEDs are on for no more of it than they may be, whatever the length of a packet."""
     packet = replace(PacketFormat.of(BOOK, 1), preamble_chips=103)
-    bank = Bank.of_chips(np.zeros((151, 10), np.uint8), BOOK, packet, LED_CLUSTERS)
+    bank = Bank.of_chips(np.zeros((151, 10), np.uint8), link_of(BOOK, packet))
     provision(board, bank, Settings(watchdog=Watchdog.IDLE, watchdog_ms=100, duty_limit=limit))
     device.run(700_000)
     on = np.flatnonzero(shown_chips(device)[:, 0])
@@ -245,7 +257,7 @@ def test_chips_that_the_board_has_none_as_long_as(device, board):
     status = board.status()
     assert (status.chip_rate_hz, status.hold) == (2000, 2)
     device.run(800_000)
-    wanted = symbol_chips(symbols, link.codebook, 4).repeat(6, axis=1).repeat(2, axis=0)
+    wanted = symbol_chips(symbols, link).repeat(6, axis=1).repeat(2, axis=0)
     check_round(shown_chips(device), wanted, 1500)
     assert board.verify(bank) == 0
     assert not board.program(bank).swapped
@@ -267,7 +279,7 @@ def test_the_commands(evlcp, tmp_path, device, board):
     record, out = tmp_path / "leds.bin", tmp_path / "chips.npy"
     record.write_bytes(device.take_led_record().to_bytes())
     well(evlcp("board", "leds", record, "--chips", out, *OPTIONS))
-    chips, whole = np.load(out), symbol_chips(symbols, link.codebook)
+    chips, whole = np.load(out), symbol_chips(symbols, link)
     assert (chips == np.resize(whole, chips.shape)).all()
     assert len(np.load(tmp_path / "chips.ticks.npy")) == len(chips)
     well(evlcp("board", "leds", record, "--chips", out, "--per-led"))

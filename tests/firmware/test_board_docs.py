@@ -42,7 +42,7 @@ def test_inventory_is_valid(tmp_path):
         ("T02", 20, 16),
         ("T03", 20, 4),
     ]
-    assert [bank.packet.pilot_every for bank in found.banks.values()] == [1, 4, 4]
+    assert [bank.link.packet.pilot_every for bank in found.banks.values()] == [1, 4, 4]
 
 
 @pytest.mark.parametrize("block", blocks("python"))

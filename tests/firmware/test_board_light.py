@@ -5,7 +5,6 @@ import pytest
 from board_lines import LINK, board_on, some_bank, state_of
 from hypothesis import given, settings, strategies as st
 
-from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from firmware_host.board.bank import Bank
 from firmware_host.board.board import Settings, provision
@@ -20,7 +19,7 @@ GOOD = some_bank(2)
 
 
 def bank_of_rows(rows):
-    return Bank.of_chips(rows, LINK.codebook, PacketFormat.of(LINK.codebook, FRAMES))
+    return Bank.of_chips(rows, LINK.with_air(frames_per_packet=FRAMES))
 
 
 def limits(board):

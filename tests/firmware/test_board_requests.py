@@ -202,8 +202,8 @@ def test_a_foreign_codebook_never_plays(wire):
     commit = commit_of(BANK)
     foreign = replace(commit, digest=bytes.fromhex(DIGESTS[protocol.Profile.WH8]))
     assert wire.each(foreign, START) == [Status.FOREIGN_CODEBOOK, Status.NOTHING_COMMITTED]
-    pilots = tuple(map(word_of_chips, BANK.codebook.pilots))
-    own = protocol.CodebookRequest(26, word_of_chips(BANK.codebook.preamble), pilots, commit.digest)
+    pilots = tuple(map(word_of_chips, BANK.link.codebook.pilots))
+    own = protocol.CodebookRequest(26, word_of_chips(BANK.link.codebook.preamble), pilots, commit.digest)
     others = replace(own, pilots=(pilots[0] ^ 1, *pilots[1:]))
     found = wire.each(own, others, replace(own, digest=bytes(32)), replace(own, preamble_chips=33))
     assert found == [Status.OK, Status.FOREIGN_CODEBOOK, Status.FOREIGN_CODEBOOK, Status.OUT_OF_RANGE]

@@ -29,7 +29,7 @@ class Bar:
         self.board = connect(chip)
         symbols = symbols_of(1, 1, FOUR)
         provision(self.board, make_bank(symbols, FOUR), Settings(start=False))
-        self.chips = symbol_chips(symbols, FOUR.codebook)
+        self.chips = symbol_chips(symbols, FOUR)
 
     def expected(self, count):
         """Rows from the first lit chip on, (count, 96)."""
@@ -262,7 +262,7 @@ def test_emulate_serves_the_model(evlcp, stm32, tmp_path):
         assert emulated.end() == 0
     well(evlcp("board", "leds", record, "--chips", out))
     chips, link = np.load(out), board_link("air.frames_per_packet=2")
-    once = symbol_chips(symbols_of(1, 4, link), link.codebook)
+    once = symbol_chips(symbols_of(1, 4, link), link)
     start = int(chips.any(1).argmax()) - int(once.any(1).argmax())
     whole = (len(chips) - start) // len(once) * len(once)
     assert whole >= len(once)
@@ -316,7 +316,7 @@ def test_interrupts_stack_and_line_have_room(bar):
     masks = np.zeros((26 + 32 * 10, 96), np.uint8)
     masks[::2] = np.random.default_rng(0).integers(0, 2, masks[::2].shape)
     link = board_link("air.chip_rate_hz=20000.0")
-    bank = Bank.of_chips(masks, link.codebook, link.packet)
+    bank = Bank.of_chips(masks, link)
     provision(bar.board, bank, Settings())
     before = bar.board.status()
     spare = 1 - before.active_bank

@@ -232,7 +232,7 @@ def test_the_real_firmware_updates_itself(stm32, monkeypatch):
     assert state_of(board) == (State.PLAYING, 0)
     assert board.status().level_ma == 13
     rows, _ = lit_rows(chip.drivers.log[begin:])
-    chips = symbol_chips(symbols, link.codebook)
+    chips = symbol_chips(symbols, link)
     expected = np.repeat(np.roll(chips, -int(chips.any(1).argmax()), axis=0), 6, axis=1)
     assert (rows == np.resize(expected, rows.shape)).all()
     assert len(rows) > 80

@@ -17,7 +17,7 @@ from board_lines import (
     symbols_of,
 )
 
-from firmware_host.board.bank import Bank, make_bank
+from firmware_host.board.bank import make_bank
 from firmware_host.board.board import Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import BoardResetError, IncompatibleError, NoBoardError, RefusedError
@@ -35,7 +35,7 @@ def test_what_is_there_is_not_sent_again(board):
     assert seen == sorted(seen)
     again = board.program(payload)
     assert (again.written, again.swapped) == (0, False)
-    assert not board.is_active_bank(Bank.of_symbols(symbols, LINK.codebook, 4), board.status())
+    assert not board.is_active_bank(make_bank(symbols, LINK.with_air(pilot_every=4)), board.status())
     assert board.program(half).bank == 1
     # bank 0 still holds the first payload: only the commit is needed
     back = board.program(payload)

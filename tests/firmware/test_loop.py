@@ -31,7 +31,7 @@ def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path):
     assert float(rest.split("distance ")[1].split(" m")[0]) == pytest.approx(80, abs=0.1)
 
     result = json.loads((out / "message.json").read_text())["symbols"]
-    expected = symbol_chips(np.array(result), LINK.codebook)
+    expected = symbol_chips(np.array(result), LINK)
     played = LedRecord.read(out / "leds.bin")
     assert (np.diff(played.ticks) == 1000).all()
     chips = np.load(out / "chips.npy")
