@@ -19,8 +19,8 @@ _PIECE = 2048
 _STEP_S = 0.005
 
 
-class NativeBoard:
-    """A board in virtual time that catches up with the clock in every `exchange`.
+class NativeBoard(Transport):
+    """A line to a board in this process, in virtual time that catches up with the clock when it is used.
 
     Args:
         leds: File for the LED records.
@@ -29,9 +29,11 @@ class NativeBoard:
 
     Raises:
         InputError: The flash file cannot be used.
-        OutputError: A file cannot be written; so does `exchange`.
+        OutputError: A file cannot be written; so does `read`.
         ToolchainError: The board cannot be built.
     """
+
+    name = "native:"
 
     def __init__(self, leds: Path | None = None, flash: Path | None = None, unique_id: int = 0) -> None:
         self._device = SimulatedBoard(bytes(4) + unique_id.to_bytes(8, "big"))
@@ -47,14 +49,30 @@ class NativeBoard:
             self._save_flash(self._device.read_flash())  # raises now if SAVE could not write it
         with writing(leds or ""):
             self._leds = None if leds is None else leds.open("wb")
-        self._start_s = time.monotonic()
+        self._start_s = self.time_s()
 
-    def exchange(self, data: bytes) -> bytes:
-        """Let time pass until now, and exchange bytes from a host for those of the board."""
-        self._device.run(int((time.monotonic() - self._start_s) * 1e6) - self._device.now_us)
+    def _catch_up(self) -> None:
+        self._device.run(int((self.time_s() - self._start_s) * 1e6) - self._device.now_us)
+
+    def write(self, data: bytes) -> None:
+        """See `Transport.write`."""
+        self._catch_up()
         for at in range(0, len(data), _PIECE):
             self._device.receive(data[at : at + _PIECE])
             self._device.run(0)
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Transport.read`."""
+        end = self.time_s() + timeout_s
+        while True:
+            self._catch_up()
+            self._write_files()
+            data, left = self._device.take_output(), end - self.time_s()
+            if data or left <= 0:
+                return data
+            time.sleep(min(left, 0.001))
+
+    def _write_files(self) -> None:
         # The slots are in the file before the answer to a SAVE is sent.
         if self._flash is not None and (held := self._device.read_flash()) != self._saved_flash:
             self._save_flash(held)
@@ -63,7 +81,6 @@ class NativeBoard:
             with writing(self._leds.name):
                 self._leds.write(records.tobytes())
                 self._leds.flush()
-        return self._device.take_output()
 
     def close(self) -> None:
         """Switch it off, and close its files."""
@@ -85,36 +102,7 @@ class NativeBoard:
         self._saved_flash = held
 
 
-class NativeLine(Transport):
-    """A line to a native board in this process, which ends with the line."""
-
-    name = "native:"
-
-    def __init__(self, board: NativeBoard) -> None:
-        self._board = board
-        self._received = b""
-
-    def read(self, timeout_s: float) -> bytes:
-        """See `Transport.read`."""
-        end = self.time_s() + timeout_s
-        while True:
-            data, self._received = self._received + self._board.exchange(b""), b""
-            left = end - self.time_s()
-            if data or left <= 0:
-                return data
-            time.sleep(min(left, 0.001))
-
-    def write(self, data: bytes) -> None:
-        """See `Transport.write`."""
-        self._received += self._board.exchange(data)
-
-    def close(self) -> None:
-        """Switch the board off."""
-        self._board.close()
-
-
 def serve_board(board: NativeBoard, line: HostLine, stopped: Callable[[], bool]) -> None:
     """Let hosts talk to a board, one at a time, until it is stopped."""
-    data = b""
     while not stopped():
-        data = line.exchange(board.exchange(data), _STEP_S)
+        board.write(line.exchange(board.read(0.0), _STEP_S))

@@ -6,7 +6,7 @@
 
 from pathlib import Path
 
-from firmware_host.emulators.native import NativeBoard, NativeLine
+from firmware_host.emulators.native import NativeBoard
 from firmware_host.ports.transport import Transport, open_transport
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
@@ -21,5 +21,5 @@ def open_port(spec: str, baud: int = DEFAULT_BAUD) -> Transport:
     """
     scheme, _, rest = spec.partition(":")
     if scheme == "native":
-        return NativeLine(NativeBoard(flash=Path(rest) if rest else None))
+        return NativeBoard(flash=Path(rest) if rest else None)
     return open_transport(spec, baud)
