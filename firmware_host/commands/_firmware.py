@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 import typer
 
 from evlcp_sdk.cli._common import progress_bar
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import Outputs, writing
 from firmware_host.commands._json import AsJson, print_result
 from firmware_host.commands._line import BoardLine, LineCommand, from_command_line, open_board
 
@@ -28,7 +30,6 @@ def build_images(
 
     For example: [bold]evlcp board build --target stm32f405-8mhz -o build[/]
     """
-    from evlcp_sdk.files import Outputs, writing
     from firmware_host.board.update import UpdatePackage
     from firmware_host.build import TARGETS, arm_image
     from firmware_host.images import FlashImage
@@ -72,7 +73,6 @@ def flash(
 
     For example: [bold]evlcp board flash --target stm32f405-8mhz --port /dev/ttyUSB0[/]
     """
-    from evlcp_sdk.errors import ConfigError
     from firmware_host.build import TARGETS, arm_image
     from firmware_host.images import FlashImage
     from firmware_host.ports.rom import BAUD, RomLoader, flash_image
@@ -131,7 +131,6 @@ def update(
 
     For example: [bold]evlcp board update stm32f405-8mhz.update.json --port /dev/ttyUSB0[/]
     """
-    from evlcp_sdk.errors import ConfigError
     from firmware_host.board import update as updates
 
     if (file is not None) + (target is not None) + confirm != 1:

@@ -6,6 +6,7 @@ import typer
 from typer.core import TyperCommand
 
 from evlcp_sdk.cli._common import echo, print_json
+from evlcp_sdk.errors import explain_fault
 
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, faults too.")]
 
@@ -20,8 +21,6 @@ def print_result(text: str, table: dict[str, Any], as_json: bool) -> None:
 
 def fault_table(fault: BaseException) -> dict[str, Any]:
     """An error as plain values: kind, exit code, message."""
-    from evlcp_sdk.errors import explain_fault
-
     message, code = explain_fault(fault)
     return {"error": {"kind": type(fault).__name__, "exit_code": code, "message": message}}
 

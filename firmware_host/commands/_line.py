@@ -11,6 +11,8 @@ import typer
 
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import echo, print_json
+from evlcp_sdk.cli._stderr import print_stderr
+from evlcp_sdk.errors import ConfigError
 from firmware_host.commands._json import JsonCommand
 
 if TYPE_CHECKING:
@@ -58,7 +60,6 @@ class BoardLine:
     @contextlib.contextmanager
     def open(self) -> "Iterator[Board]":
         """Open the board on the line, or the recorded one."""
-        from evlcp_sdk.errors import ConfigError
         from firmware_host.board.board import Board
         from firmware_host.board.keys import read_board_key
         from firmware_host.board.session import Session
@@ -147,7 +148,6 @@ KeepAlive = Annotated[
 
 def keep_alive(board: "Board") -> None:
     """Keep a board's watchdog from acting until Ctrl-C; print changes of state and faults on stderr."""
-    from evlcp_sdk.cli._stderr import print_stderr
     from firmware_host.board.tables import enum_name, flag_names
     from firmware_host.protocol.generated.requests import BoardFault, State
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -11,6 +13,10 @@ import typer
 
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, echo, print_json, progress_bar
+from evlcp_sdk.cli._stderr import print_stderr
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.files import Outputs, check_output
+from evlcp_sdk.signals import stop_on_request
 from firmware_host.commands import _firmware
 from firmware_host.commands._json import AsJson, JsonCommand, fault_table, print_result
 from firmware_host.commands._line import (
@@ -190,7 +196,6 @@ def program(
 
 
 def _check_inventory_options(context: typer.Context, *allowed: str) -> None:
-    from evlcp_sdk.errors import ConfigError
 
     given = [
         "/".join([*parameter.opts, *parameter.secondary_opts])
@@ -294,8 +299,6 @@ def start(
 
     For example: [bold]evlcp board start --inventory tunnel.toml --pulse-hz 1[/]
     """
-    from evlcp_sdk.errors import ConfigError
-
     if pulse_hz is not None:
         _start_together(context, inventory, pulse_hz, timeout, as_json)
         return
@@ -453,9 +456,7 @@ def _watch_fleet(
 
     `quiet` prints only lost and returned boards.
     """
-    import threading
     from concurrent.futures import ThreadPoolExecutor
-    from functools import partial
 
     from firmware_host.board.fleet import open_entry
     from firmware_host.board.monitor import watch_board
@@ -487,7 +488,6 @@ def _print_event(
     event: StatusReply | BoardGone | BoardReturned | KeyMissing, which: dict[str, Any], as_json: bool
 ) -> None:
     """Print a line of `monitor`: a status on stdout, other events on stderr."""
-    from evlcp_sdk.cli._stderr import print_stderr
     from firmware_host.board.monitor import BoardGone, BoardReturned, KeyMissing
     from firmware_host.board.tables import enum_name, status_table
     from firmware_host.protocol.generated.requests import State
@@ -615,8 +615,6 @@ def emulate(
 
     For example: [bold]evlcp board emulate native --listen unix:/tmp/board --leds leds.bin[/]
     """
-    from evlcp_sdk.files import check_output
-    from evlcp_sdk.signals import stop_on_request
     from firmware_host.emulators.listening import HostLine, check_listen_address
     from firmware_host.emulators.models import part_image, serve_part
     from firmware_host.emulators.native import NativeBoard, serve_board
@@ -708,8 +706,6 @@ def leds(
 
     For example: [bold]evlcp board leds leds.bin --chips chips.npy[/]
     """
-    from evlcp_sdk.errors import ConfigError, InputError
-    from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.resolve import load_link
     from firmware_host.emulators.led_record import LedRecord
 

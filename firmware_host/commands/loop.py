@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -36,14 +37,11 @@ def loop(
     Your own text:       [bold]evlcp loop --text "Tempo 30" --distance 60[/]
     At slower chips:     [bold]evlcp loop --set air.chip_rate_hz=5000.0[/]
     """
-    import json
-
     from evlcp_sdk.diagnosis.facts import Diagnostic
     from evlcp_sdk.link.resolve import load_link
-    from evlcp_sdk.plugin.registry import Registry
     from firmware_host.loop import run_loop
 
-    link = load_link(link_file, overrides or [], Registry.load())
+    link = load_link(link_file, overrides or [])
     screen = console()
     if not as_json:
         screen.print(

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from time import time as clock_s
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, progress_bar
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.files import Outputs, read_bytes
+from evlcp_sdk.signals import stop_on_request
 from firmware_host.commands._json import AsJson, print_result
 from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, print_program_result
 from firmware_host.commands.stream import Ahead, print_stream_result
@@ -69,10 +74,6 @@ class ContentOptions:
             ConfigError: It is empty, or there are options of a beacon without one.
             InputError: The file cannot be read.
         """
-        from time import time as clock_s
-
-        from evlcp_sdk.errors import ConfigError
-        from evlcp_sdk.files import read_bytes
         from evlcp_sdk.link.compose import encode_utf8
         from firmware_host.board.messages import Content, choose_site
 
@@ -176,14 +177,12 @@ def message(
     Onto a board:    [bold]evlcp tx message --text "Tempo 30" --port /dev/ttyUSB0[/]
     A countdown:     [bold]evlcp tx message --countdown 30 --every 1 --port /dev/ttyUSB0[/]
     """
-    from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.link.resolve import load_link
-    from evlcp_sdk.plugin.registry import Registry
     from firmware_host.board.bank import make_bank
     from firmware_host.board.board import Settings, provision
     from firmware_host.board.symbols import symbols_table
 
-    link = load_link(link_file, overrides or [], Registry.load())
+    link = load_link(link_file, overrides or [])
     made = content.make()
     if anew.every is None and anew.count is not None:
         raise ConfigError("--count belongs to --every SECONDS")
@@ -216,7 +215,6 @@ def message(
 def _write_files(
     symbols: NDArray[np.int64], link: Link, table: dict[str, Any], out: Path | None, chips: Path | None
 ) -> None:
-    from evlcp_sdk.files import Outputs
     from firmware_host.board.bank import symbol_chips
 
     with Outputs() as outputs:
@@ -230,10 +228,6 @@ def _write_files(
 def _send_periodically(
     content: Content, link: Link, line: BoardLine | None, repeat: int, anew: PeriodOptions, *, as_json: bool
 ) -> None:
-    from contextlib import suppress
-
-    from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.signals import stop_on_request
     from firmware_host.board.messages import check_interval, send_periodically
 
     assert anew.every is not None
@@ -250,8 +244,6 @@ def _send_periodically(
 
 def _encode_content(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int64], dict[str, Any]]:
     """Symbols of the packets with the content now, and a summary of its messages."""
-    from time import time as clock_s
-
     from evlcp_sdk.link.compose import encode_messages
 
     messages = content.messages_at(link, clock_s())

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import queue
+import sys
+import threading
+import time
 from collections.abc import Iterable, Iterator
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -11,6 +17,8 @@ import typer
 
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.signals import stop_on_request
 from firmware_host.commands._json import AsJson, print_result
 from firmware_host.commands._line import open_board
 
@@ -52,13 +60,9 @@ def stream(
 
     For example: [bold]date +%T | evlcp board --port native: stream[/]
     """
-    from itertools import takewhile
-
     from evlcp_sdk.link.resolve import load_link
-    from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.signals import stop_on_request
 
-    link = load_link(link_file, overrides or [], Registry.load())
+    link = load_link(link_file, overrides or [])
     # a link without room for messages is refused before the board waits
     coder = link.block_coder() if lines == "text" else None
     if coder is not None:
@@ -94,12 +98,8 @@ def _read_packets(
     file: Path, link: Link, coder: BlockCoder | None, transmitter_id: int, repeat: int
 ) -> Iterator[Iterable[NDArray[np.int64]] | None]:
     """Packets (frames, clusters) of each line of input; None while there is none."""
-    import json
-    import time
-
     import numpy as np
 
-    from evlcp_sdk.errors import ConfigError, InputError
     from evlcp_sdk.link.compose import iterate_packets, make_messages
     from firmware_host.board.symbols import parse_symbols
 
@@ -139,12 +139,6 @@ def _list_depth(table: Any) -> int:
 
 def _read_lines(file: Path) -> Iterator[str | None]:
     """Each line of input; None while there is none."""
-    import queue
-    import sys
-    import threading
-
-    from evlcp_sdk.errors import InputError
-
     received: queue.Queue[str | Exception | None] = queue.Queue(_MAX_LINES)
 
     def read() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -9,6 +10,7 @@ import typer
 
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import echo, print_json
+from evlcp_sdk.errors import ConfigError
 from firmware_host.commands._json import AsJson, JsonCommand
 from firmware_host.commands._source import SymbolOptions
 from firmware_host.commands.message import keygen, message
@@ -92,7 +94,6 @@ def _format_hex(symbols: NDArray[np.int64], link: Link) -> str:
 
 
 def _format_json(symbols: NDArray[np.int64], link: Link) -> str:
-    import json
 
     from firmware_host.board.symbols import symbols_table
 
@@ -107,7 +108,6 @@ def _format_json(symbols: NDArray[np.int64], link: Link) -> str:
 
 
 def _format_c(symbols: NDArray[np.int64], link: Link) -> str:
-    from evlcp_sdk.errors import ConfigError
 
     book = link.codebook
     bits = next((n for n in (16, 32, 64) if n >= link.packet.info_chips), None)
