@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.air.blocks import Kind, Message
+from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs, read_json, writing
 from evlcp_sdk.link.compose import encode_messages, make_messages
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.text import to_toml
-from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.sim import read_truth
@@ -24,9 +23,8 @@ from evlcp_sdk.sim.truth import truth_path
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.score import score_frames
-from evlcp_sdk.values import ReceivedMessage
 from firmware_host.board.bank import make_bank, symbol_chips
-from firmware_host.board.board import Board, ProgramResult, Settings, provision
+from firmware_host.board.board import Board, ProgramResult, Progress, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.board.symbols import symbols_table
 from firmware_host.board.tables import info_table
@@ -132,7 +130,7 @@ def run_loop(
     distance_m: float = 50.0,
     seed: int = 0,
     sinks: Sequence[str] = (),
-    progress: Callable[[float], None] = lambda _: None,
+    progress: Progress = lambda _, __: None,
 ) -> Iterator[Step]:
     """Send a text by an emulated board to a simulated camera, and read it; yield each step when it is done.
 
@@ -145,7 +143,7 @@ def run_loop(
         distance_m: From the camera to the bar.
         seed: Of the scene: its noise, and the camera's start in a packet.
         sinks: Output formats besides the default ones, by name.
-        progress: Called while the scene is rendered, with the share done.
+        progress: Called while the scene is rendered, with seconds done and seconds in all.
 
     Raises:
         BoardError: The board refuses; see `light_of`.
@@ -183,14 +181,8 @@ def run_loop(
     scene = _make_scene(light, link, folder / _CHIPS, distance_m, in_view, seed)
     yield _scene_step(scene, symbols, len(light.chips) // link.packet.packet_chips, folder, seed, progress)
 
-    decoded = _DecodedTexts()
-    yield _receiver_step(link, folder, decoded, sinks)
-    texts = list(dict.fromkeys(decoded.texts))
-    quoted, as_sent = ", ".join(f'"{one}"' for one in texts), text in texts
-    times = "once" if decoded.packets == 1 else f"from {decoded.packets} packets"
-    summary = f"{quoted}, read {times}" + ("" if as_sent else ": not what was sent")
-    figures = {"texts": texts, "packets": decoded.packets, "as_sent": as_sent}
-    yield Step("text", summary if texts else "none was read", figures)
+    yield _receiver_step(link, folder, sinks)
+    yield _text_step(text, folder / RECEIVED)
 
 
 def _message_step(text: str, message: Message, symbols: NDArray[np.int64], link: Link, folder: Path) -> Step:
@@ -267,11 +259,11 @@ def _scene_step(
     packets: int,
     folder: Path,
     seed: int,
-    progress: Callable[[float], None],
+    progress: Progress,
 ) -> Step:
     raw, duration_s = folder / RECORDING, scene["duration_s"]
     simulated = simulate(scene, seed)
-    _, truth_file = simulated.save(raw, lambda done_s: progress(done_s / duration_s))
+    _, truth_file = simulated.save(raw, lambda done_s: progress(done_s, duration_s))
     _add_symbols(truth_file, symbols, packets)
     distance_m, events = scene["motion"]["distance_m"], simulated.simulation.counts["events"]
     size, duration_s = raw.stat().st_size, round(duration_s, 6)
@@ -283,11 +275,10 @@ def _scene_step(
     return Step("scene", summary, figures, (raw.name, truth_file.name))
 
 
-def _receiver_step(link: Link, folder: Path, decoded: "_DecodedTexts", sinks: Sequence[str]) -> Step:
+def _receiver_step(link: Link, folder: Path, sinks: Sequence[str]) -> Step:
     raw = folder / RECORDING
-    summary = receive_to_folder(raw, folder / RECEIVED, link, registry=Registry.load(decoded), sinks=sinks)
-    counts, transmitters = summary["counts"], summary["transmitters"]
-    decoded.packets = counts["blocks_decoded"] + counts["blocks_combined"]
+    summary = receive_to_folder(raw, folder / RECEIVED, link, sinks=sinks)
+    transmitters = summary["transmitters"]
     # The written rows, as for `evlcp score`.
     score = score_frames(read_frames(folder / RECEIVED), read_truth(truth_path(raw)))
     (scored,), (road,) = score["bars"], score["road"]["bars"]
@@ -315,17 +306,17 @@ def _describe_frames(figures: dict[str, Any]) -> str:
     return summary + ("" if figures["distance_m"] is None else f"; distance {figures['distance_m']:.2f} m")
 
 
-class _DecodedTexts:
-    """Collects the decoded texts, and the number of packets with a block."""
-
-    def __init__(self) -> None:
-        self.texts: list[str] = []
-        self.packets = 0
-
-    @hookimpl
-    def evlcp_stage_finished(self, stage: str, value: object) -> None:
-        if stage == "message" and isinstance(value, ReceivedMessage) and value.message.kind == Kind.TEXT:
-            self.texts.append(value.value)
+def _text_step(text: str, received: Path) -> Step:
+    counts = read_json(received / "summary.json")["counts"]
+    with (received / "packets.jsonl").open(encoding="utf-8") as file:
+        rows = [json.loads(line) for line in file]
+    texts = list(dict.fromkeys(row["text"] for row in rows if row["kind"] == "text"))
+    packets = counts["blocks_decoded"] + counts["blocks_combined"]
+    quoted, as_sent = ", ".join(f'"{one}"' for one in texts), text in texts
+    times = "once" if packets == 1 else f"from {packets} packets"
+    summary = f"{quoted}, read {times}" + ("" if as_sent else ": not what was sent")
+    figures = {"texts": texts, "packets": packets, "as_sent": as_sent}
+    return Step("text", summary if texts else "none was read", figures)
 
 
 def _add_symbols(truth_file: Path, symbols: NDArray[np.int64], packets: int) -> None:

@@ -37,8 +37,8 @@ _MAX_HOLD = 255
 _SMALLEST_PIECE_BYTES = 32
 """Smallest piece that is tried on a noisy line."""
 
-Progress = Callable[[int, int], None]
-"""Called with bytes done and bytes in all."""
+Progress = Callable[[float, float], None]
+"""Called with the amount done and that in all, bytes or seconds."""
 
 
 @dataclass(frozen=True)

@@ -50,13 +50,7 @@ def loop(
     files: list[str] = []
     sinks = ["report"] if report else []
     with progress_bar("rendering") as bar:
-
-        def advance(share: float) -> None:
-            bar(share, 1.0)
-
-        for step in run_loop(
-            text, link, out, distance_m=distance_m, seed=seed, sinks=sinks, progress=advance
-        ):
+        for step in run_loop(text, link, out, distance_m=distance_m, seed=seed, sinks=sinks, progress=bar):
             files += step.files
             if as_json:
                 echo(json.dumps({"step": step.name, **step.figures, "files": list(step.files)}))
