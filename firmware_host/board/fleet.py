@@ -107,17 +107,8 @@ class _Tables:
     defaults: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Inventory:
-    """The boards of a file, and the bank of each by its id."""
-
-    path: Path
-    entries: tuple[FleetEntry, ...]
-    banks: Mapping[str, Bank]
-
-
-def read_inventory(path: Path) -> Inventory:
-    """Read an inventory and the banks of its boards.
+def read_inventory(path: Path) -> tuple[tuple[FleetEntry, ...], dict[str, Bank]]:
+    """Read the boards of an inventory, and the bank of each by its id.
 
     Raises:
         ConfigError: See `read_entries`; or a link or a message is wrong, or a board cannot play it.
@@ -125,8 +116,7 @@ def read_inventory(path: Path) -> Inventory:
         IncompatibleError: A payload was made with another link.
     """
     entries, registry = read_entries(path), Registry.load()
-    banks = {entry.id: _load_bank(path, n, entry, registry) for n, entry in enumerate(entries)}
-    return Inventory(path, entries, banks)
+    return entries, {entry.id: _load_bank(path, n, entry, registry) for n, entry in enumerate(entries)}
 
 
 def read_entries(path: Path) -> tuple[FleetEntry, ...]:
@@ -266,16 +256,18 @@ def run_fleet(path: Path, entries: Sequence[FleetEntry], work: Work, report: Rep
         )
 
 
-def program_fleet(inventory: Inventory, verify: bool, report: Report) -> None:
-    """Program all boards at once; errors as of `run_fleet`."""
+def program_fleet(
+    path: Path, entries: Sequence[FleetEntry], banks: Mapping[str, Bank], verify: bool, report: Report
+) -> None:
+    """Program all boards of an inventory at once; errors as of `run_fleet`."""
 
     def work(entry: FleetEntry, board: Board) -> tuple[str, dict[str, Any]]:
         start = time.monotonic()
-        done = provision(board, inventory.banks[entry.id], entry.settings, verify)
+        done = provision(board, banks[entry.id], entry.settings, verify)
         table = {"written_bytes": done.written, "swapped": done.swapped}
         if not done.swapped:
             return f"was there already ({done.length} bytes)", table
         elapsed = time.monotonic() - start
         return f"programmed {done.written} of {done.length} bytes in {elapsed:.2f} s", table
 
-    run_fleet(inventory.path, inventory.entries, work, report)
+    run_fleet(path, entries, work, report)

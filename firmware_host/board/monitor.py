@@ -16,17 +16,6 @@ _LONGEST_PAUSE_S = 5.0
 
 
 @dataclass(frozen=True)
-class BoardGone:
-    """The board does not answer; it is tried again until it does.
-
-    Attributes:
-        fault: The reason.
-    """
-
-    fault: BoardError
-
-
-@dataclass(frozen=True)
 class BoardReturned:
     """The board answers again.
 
@@ -49,7 +38,7 @@ def watch_board(
     reconnect: bool = True,
     at_first: bool = False,
     end: threading.Event | None = None,
-) -> Iterator[StatusReply | BoardGone | BoardReturned | KeyMissing]:
+) -> Iterator[StatusReply | BoardError | BoardReturned | KeyMissing]:
     """Yield a board's status every `interval_s`, and keep its watchdog from acting in between.
 
     Only a host with the board's key can do that; without it `KeyMissing` is yielded once.
@@ -97,6 +86,6 @@ def watch_board(
                     raise
                 if lost_s is None:
                     lost_s = time.monotonic()
-                    yield BoardGone(fault)
+                    yield fault
                 ended.wait(pause_s)
                 pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from firmware_host.board.session import Session
 from firmware_host.errors import BoardError, NoBoardError
 from firmware_host.ports.transport import open_transport
-from firmware_host.ports.usb import SerialPort, UsbFilter, serial_ports
+from firmware_host.ports.usb import BRIDGES, SerialPort, serial_ports, usb_filter
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import HelloReply
 
@@ -23,18 +23,25 @@ class SurveyedPort:
     fault: str
 
 
-def survey_ports(baud: int, usb: UsbFilter | None = None, every: bool = False) -> list[SurveyedPort]:
+def survey_ports(
+    baud: int, usb: str | None = None, every: bool = False, ask: bool = True
+) -> list[SurveyedPort]:
     """List serial ports, all or with a USB id, and send HELLO at once to those that may have a board.
 
     Nothing is written to a port unless its USB id is given, or that of a bridge that boards usually have, as
-    any other device may be there; `every` sends to all listed ports.
+    any other device may be there; `every` sends to all listed ports, and without `ask` none is written to.
+
+    Raises:
+        ConfigError: It is no USB id; see `usb_filter`.
     """
-    listed = [p for p in serial_ports() if usb is None or usb.matches(p)]
+    listed = serial_ports() if usb is None else list(filter(usb_filter(usb), serial_ports()))
     if not listed:
         return []
 
     def probe(port: SerialPort) -> SurveyedPort:
-        if not (every or usb is not None or port.has_common_bridge):
+        if not ask:
+            return SurveyedPort(port, False, None, "not asked")
+        if not (every or usb is not None or port.usb in BRIDGES):
             return SurveyedPort(port, False, None, "no USB id of a board's bridge: not asked")
         try:
             line = open_transport(port.device, baud)

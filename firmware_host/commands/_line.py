@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -165,12 +165,10 @@ def keep_alive(board: "Board") -> None:
 def print_program_result(done: Any, as_json: bool) -> None:
     """Print the result of programming."""
     if as_json:
-        import dataclasses
-
-        print_json(dataclasses.asdict(done))
-    elif not done.swapped:
+        print_json(asdict(done))
+        return
+    if not done.swapped:
         echo(f"was there already: {done.length} bytes in bank {done.bank}")
     else:
         echo(f"sent {done.written} of {done.length} bytes; bank {done.bank} is active")
-    if not as_json:
-        print_watchdog(done.watchdog, done.watchdog_ms)
+    print_watchdog(done.watchdog, done.watchdog_ms)

@@ -34,14 +34,14 @@ from firmware_host.commands._line import (
 )
 from firmware_host.commands._source import BankOptions
 from firmware_host.commands.stream import stream
+from firmware_host.errors import BoardError, RefusedError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
-    from firmware_host.board.bank import Bank
     from firmware_host.board.board import Board
     from firmware_host.board.fleet import FleetEntry
-    from firmware_host.board.monitor import BoardGone, BoardReturned, KeyMissing
+    from firmware_host.board.monitor import BoardReturned, KeyMissing
     from firmware_host.protocol.generated.requests import StatusReply
 
 app = typer.Typer(
@@ -95,17 +95,11 @@ def ports(
 
     For example: [bold]evlcp board ports --usb 0403[/]
     """
-    from firmware_host.board.survey import SurveyedPort, survey_ports
+    from firmware_host.board.survey import survey_ports
     from firmware_host.board.tables import info_table
-    from firmware_host.ports.usb import UsbFilter, serial_ports
 
     line: BoardLine = context.obj
-    wanted = None if usb is None else UsbFilter.parse(usb)
-    if ask:
-        found = survey_ports(line.baud, wanted, every)
-    else:
-        listed = [p for p in serial_ports() if wanted is None or wanted.matches(p)]
-        found = [SurveyedPort(p, False, None, "not asked") for p in listed]
+    found = survey_ports(line.baud, usb, every, ask)
     if as_json:
         rows = []
         for f in found:
@@ -176,10 +170,10 @@ def program(
         _check_inventory_options(context, "verify", "stay")
         from firmware_host.board.fleet import program_fleet, read_inventory
 
-        boards = read_inventory(inventory)
-        program_fleet(boards, verify, _make_reporter(as_json))
+        entries, banks = read_inventory(inventory)
+        program_fleet(inventory, entries, banks, verify, partial(print_result, as_json=as_json))
         if stay:
-            _watch_fleet(inventory, boards.entries, 1.0, None, True, as_json, quiet=True)
+            _watch_fleet(inventory, entries, 1.0, None, True, as_json, quiet=True)
         return
     from firmware_host.board.board import Settings, provision
     from firmware_host.protocol.generated.requests import Watchdog
@@ -212,10 +206,6 @@ def _check_inventory_options(context: typer.Context, *allowed: str) -> None:
         )
 
 
-def _make_reporter(as_json: bool) -> Callable[[str, dict[str, Any]], None]:
-    return lambda text, table: print_result(text, table, as_json)
-
-
 def _run_on_boards(
     context: typer.Context,
     inventory: Path | None,
@@ -235,7 +225,7 @@ def _run_on_boards(
     from firmware_host.board.fleet import read_entries, run_fleet
 
     _check_inventory_options(context, *allowed)
-    run_fleet(inventory, read_entries(inventory), work, _make_reporter(as_json))
+    run_fleet(inventory, read_entries(inventory), work, partial(print_result, as_json=as_json))
 
 
 @app.command(cls=LineCommand)
@@ -251,7 +241,6 @@ def send(
 
     For example: [bold]evlcp board --port unix:/tmp/board send --random 4 --seed 7[/]
     """
-    from firmware_host.errors import RefusedError
     from firmware_host.protocol.generated.requests import NO_BANK, Status
 
     bank = payload.load_bank()
@@ -485,18 +474,18 @@ def _watch_fleet(
 
 
 def _print_event(
-    event: StatusReply | BoardGone | BoardReturned | KeyMissing, which: dict[str, Any], as_json: bool
+    event: StatusReply | BoardError | BoardReturned | KeyMissing, which: dict[str, Any], as_json: bool
 ) -> None:
     """Print a line of `monitor`: a status on stdout, other events on stderr."""
-    from firmware_host.board.monitor import BoardGone, BoardReturned, KeyMissing
+    from firmware_host.board.monitor import BoardReturned, KeyMissing
     from firmware_host.board.tables import enum_name, status_table
     from firmware_host.protocol.generated.requests import State
 
     name = which.get("id") or which["port"]
-    if isinstance(event, BoardGone):
+    if isinstance(event, BoardError):
         if as_json:
-            print_json(which | fault_table(event.fault))
-        print_stderr(f"{event.fault}; it is looked for, end with Ctrl-C")
+            print_json(which | fault_table(event))
+        print_stderr(f"{event}; it is looked for, end with Ctrl-C")
     elif isinstance(event, BoardReturned):
         if as_json:
             print_json(which | {"back_after_s": round(event.after_s, 3)})
@@ -528,12 +517,12 @@ def verify(
     For example: [bold]evlcp board --port /dev/ttyUSB0 verify SYMBOLS.json[/]
     """
     if inventory is None:
-        banks: Mapping[str, Bank] = {"": payload.load_bank()}
+        banks = {"": payload.load_bank()}
     else:
         from firmware_host.board.fleet import read_inventory
 
         _check_inventory_options(context)
-        banks = read_inventory(inventory).banks
+        _, banks = read_inventory(inventory)
 
     def compare(entry: FleetEntry | None, board: Board) -> tuple[str, dict[str, Any]]:
         bank = banks[entry.id if entry else ""]

@@ -1,6 +1,7 @@
 """Serial ports of this machine with their USB ids, and which of them may have a board."""
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from evlcp_sdk.errors import ConfigError
@@ -32,42 +33,22 @@ class SerialPort:
     usb: str | None = None
     serial_number: str | None = None
 
-    @property
-    def has_common_bridge(self) -> bool:
-        """Whether its USB id is that of a bridge that boards usually have."""
-        return self.usb in BRIDGES
 
+def usb_filter(text: str) -> Callable[[SerialPort], bool]:
+    """Whether a port is of the USB devices `VID`, `VID:PID` or `VID:PID:SERIAL`, four hex digits an id.
 
-@dataclass(frozen=True)
-class UsbFilter:
-    """USB devices by id and serial number.
+    Raises:
+        ConfigError: It is none of these.
 
-    Attributes:
-        parts: Vendor id, product id, four hex digits each, and serial number; the later ones are optional.
-
-    >>> UsbFilter.parse("0403:6015:D30A1").matches(SerialPort("COM7", "", "0403:6015", "D30A1"))
+    >>> usb_filter("0403:6015:D30A1")(SerialPort("COM7", "", "0403:6015", "D30A1"))
     True
     """
-
-    parts: tuple[str, ...]
-
-    @classmethod
-    def parse(cls, text: str) -> "UsbFilter":
-        """Read `VID`, `VID:PID` or `VID:PID:SERIAL`.
-
-        Raises:
-            ConfigError: It is none of these.
-        """
-        found = re.fullmatch(r"([0-9a-fA-F]{4})(?::([0-9a-fA-F]{4})(?::(.+))?)?", text)
-        if found is None:
-            raise ConfigError(f"USB id {text!r}: expected VID, VID:PID or VID:PID:SERIAL, such as 0403:6015")
-        vendor, product, serial = found.groups("")
-        return cls(tuple(part for part in (vendor.lower(), product.lower(), serial) if part))
-
-    def matches(self, port: SerialPort) -> bool:
-        """Whether a port is one of these."""
-        found = (*(port.usb or "").split(":"), port.serial_number)
-        return found[: len(self.parts)] == self.parts
+    found = re.fullmatch(r"([0-9a-fA-F]{4})(?::([0-9a-fA-F]{4})(?::(.+))?)?", text)
+    if found is None:
+        raise ConfigError(f"USB id {text!r}: expected VID, VID:PID or VID:PID:SERIAL, such as 0403:6015")
+    vendor, product, serial = found.groups("")
+    wanted = tuple(part for part in (vendor.lower(), product.lower(), serial) if part)
+    return lambda port: (*(port.usb or "").split(":"), port.serial_number)[: len(wanted)] == wanted
 
 
 def serial_ports() -> list[SerialPort]:
@@ -95,8 +76,7 @@ def find_usb_device(text: str) -> str:
         ConfigError: It is no USB id.
         NoBoardError: There is none, or there are several.
     """
-    wanted = UsbFilter.parse(text)
-    found = [port for port in serial_ports() if wanted.matches(port)]
+    found = list(filter(usb_filter(text), serial_ports()))
     if len(found) == 1:
         return found[0].device
     if not found:

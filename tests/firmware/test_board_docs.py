@@ -35,14 +35,14 @@ def test_inventory_is_valid(tmp_path):
     )
     make_key(tmp_path / "private.pem")
     (tmp_path / "tunnel.toml").write_text(blocks("toml")[0])
-    found = read_inventory(tmp_path / "tunnel.toml")
+    entries, banks = read_inventory(tmp_path / "tunnel.toml")
     # beacon, signature (two packets) and text
-    assert [(e.id, e.level_ma, found.banks[e.id].packets) for e in found.entries] == [
+    assert [(e.id, e.level_ma, banks[e.id].packets) for e in entries] == [
         ("T01", 20, 1),
         ("T02", 20, 16),
         ("T03", 20, 4),
     ]
-    assert [bank.link.packet.pilot_every for bank in found.banks.values()] == [1, 4, 4]
+    assert [bank.link.packet.pilot_every for bank in banks.values()] == [1, 4, 4]
 
 
 @pytest.mark.parametrize("block", blocks("python"))

@@ -36,7 +36,7 @@ def test_a_boards_link(tmp_path):
     (tmp_path / "links" / "fast.toml").write_text("[air]\nchip_rate_hz = 20000.0\n")
     extra = {1: "link = {air = {pilot_every = 4, frames_per_packet = 8}}\n", 2: 'link = "links/fast.toml"\n'}
     file = inventory(tmp_path / "three.toml", ["unix:/a", "unix:/b", "unix:/c"], extra)
-    banks = list(read_inventory(file).banks.values())
+    banks = list(read_inventory(file)[1].values())
     assert [b.link.packet.pilot_every for b in banks] == [1, 4, 1]
     assert [b.link.packet.frames for b in banks] == [10, 8, 10]
     assert [b.chip_rate_hz for b in banks] == [10_000, 10_000, 20_000]
@@ -44,7 +44,7 @@ def test_a_boards_link(tmp_path):
     inventory(file, ["unix:/a", "unix:/b"], {1: "link = {}\n"})
     text = file.read_text().replace("random = 16", 'random = 16\nlink = {modulation = {id = "wh8"}}')
     file.write_text(text)
-    assert [bank.link.codebook.profile for bank in read_inventory(file).banks.values()] == ["wh8", "wh4x2"]
+    assert [bank.link.codebook.profile for bank in read_inventory(file)[1].values()] == ["wh8", "wh4x2"]
 
 
 def test_two_of_four(evlcp, boards, tmp_path):

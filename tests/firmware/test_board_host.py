@@ -10,10 +10,10 @@ import pytest
 from board_lines import FatalLine, board_on, check_fault, some_bank, well
 
 from firmware_host.board.board import Board, Settings, provision
-from firmware_host.board.monitor import BoardGone, BoardReturned, watch_board
+from firmware_host.board.monitor import BoardReturned, watch_board
 from firmware_host.board.session import Session
 from firmware_host.board.stream import Stream
-from firmware_host.errors import LineError, NoBoardError, VerifyError
+from firmware_host.errors import BoardResetError, LineError, NoBoardError, VerifyError
 from firmware_host.ports.transport import SocketTransport
 from firmware_host.protocol.generated.requests import BoardFault, State, StatusReply, Watchdog
 
@@ -136,15 +136,14 @@ def test_a_monitor_finds_its_board_again(device):
     twice = [StatusReply] * 2
     assert [type(s) for s in seen] == [
         *twice,
-        BoardGone,
+        LineError,
         BoardReturned,
         *twice,
-        BoardGone,
+        BoardResetError,
         BoardReturned,
         *twice,
     ]
-    assert isinstance(seen[2], BoardGone)
-    assert "the line broke" in str(seen[2].fault)
+    assert "the line broke" in str(seen[2])
     assert isinstance(seen[3], BoardReturned)
     assert seen[3].after_s >= 0.5
     assert not list(lines)

@@ -15,7 +15,7 @@ from board_lines import check_fault
 from evlcp_sdk.errors import ConfigError
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.ports.transport import SerialTransport, open_transport
-from firmware_host.ports.usb import UsbFilter, find_usb_device, serial_ports
+from firmware_host.ports.usb import find_usb_device, serial_ports, usb_filter
 
 serial = pytest.importorskip("serial")
 Fault = serial.SerialException
@@ -71,8 +71,7 @@ def opened(monkeypatch):
     ],
 )
 def test_ports_by_usb_id(ports, text, takes):
-    wanted = UsbFilter.parse(text)
-    assert [p.device for p in serial_ports() if wanted.matches(p)] == takes
+    assert [p.device for p in filter(usb_filter(text), serial_ports())] == takes
     if takes:
         assert find_usb_device(text) == takes[0]
     else:
@@ -83,7 +82,7 @@ def test_ports_by_usb_id(ports, text, takes):
 def test_a_usb_id_must_be_one(ports, opened):
     for wrong in ("", "403", "0403-6015", "xyz0", "0403:"):
         with pytest.raises(ConfigError, match="expected VID, VID:PID or VID:PID:SERIAL"):
-            UsbFilter.parse(wrong)
+            usb_filter(wrong)
     with pytest.raises(NoBoardError, match="COM7: cannot be opened"):
         open_transport("usb:0403")
     ports.append(listed_port("COM8", 0x0403, 0x6015, "D30A2"))
