@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_uart.light import CONTEXTS, OUTLIER, TICKS, Floats, Light, Ticks, guess_lights, log_sum_exp
+from evlcp_uart.light import CONTEXTS, TICKS, Floats, Light, Ticks, guess_lights, log_sum_exp
 from evlcp_uart.reader import CLOCK_SHARE, MIN_CHARACTERS, TAIL, CharacterReader, Stretch
 
 _MIN_WORTH = 0.5
@@ -239,7 +239,7 @@ def _score_light(reader: CharacterReader, stretch: Stretch, light: Light, starts
     places = (starts[:, None] + reader.bit_offsets(light)).ravel()
     at = np.concatenate([places, marks])
     windows = stretch.windows[at].astype(np.float64)
-    ratios = np.logaddexp(light.likelihood_ratios(windows), np.log(OUTLIER))
+    ratios = light.likelihood_ratios(windows)
     words = ratios[: len(places)].reshape(len(starts), bits, CONTEXTS)
     score = log_sum_exp(reader.characters.likelihoods(words)) - reader.characters.data_bits * np.log(2)
     return float(score.sum() + ratios[len(places) :, -1].sum())

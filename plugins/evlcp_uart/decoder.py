@@ -76,11 +76,11 @@ class Character:
 
 @dataclass(frozen=True, eq=False)
 class CharacterState:
-    """The state of decoding a stream.
+    """The state of decoding a stream; without arguments that before the first event.
 
     Attributes:
-        first: Tick of the stream at which `counts` starts; None before the first event.
-        counts: Events of each tick, OFF and ON, int32 (2, n).
+        first: Tick of the stream at which `counts` starts.
+        counts: Events of each tick, OFF and ON, int32 (2, n); n is 0 before the first event.
         start: Tick before which no character may start: the end of the last one.
         known_from: First tick whose events are known; a character may start before it.
         light: The light, once it is learned.
@@ -92,7 +92,7 @@ class CharacterState:
         tally: Counts so far.
     """
 
-    first: int | None = None
+    first: int = 0
     counts: NDArray[np.int32] = field(default_factory=lambda: np.zeros((2, 0), np.int32))
     start: int = 0
     known_from: int = 0
@@ -128,10 +128,6 @@ class CharacterDecoder:
     bit_us: float
     mark_on: bool
 
-    def init(self) -> CharacterState:
-        """Return the state before the first event."""
-        return CharacterState()
-
     def step(
         self, state: CharacterState, t_us: Ticks, p: NDArray[np.uint8], until_us: float
     ) -> tuple[CharacterState, list[Character]]:
@@ -149,7 +145,7 @@ class CharacterDecoder:
     def close(self, state: CharacterState) -> tuple[CharacterState, list[Character]]:
         """End the stream; return the characters that are left."""
         n = state.counts.shape[1]
-        if state.first is None or not n:
+        if not n:
             return state, []
         return self._decode_stretch(state, n, last=True)
 
@@ -165,9 +161,9 @@ class CharacterDecoder:
         self, state: CharacterState, t_us: Ticks, p: NDArray[np.uint8], until_us: float
     ) -> CharacterState:
         """Count events by tick, on a grid fixed in time."""
-        first = state.first
+        first, known = state.first, state.counts.shape[1]
         tick_us = self.bit_us / TICKS
-        if first is None:
+        if not known:
             if not len(t_us):
                 return state
             # A character may have started before its first event.
@@ -175,7 +171,6 @@ class CharacterDecoder:
             first = known_from - self.reader.length - TICKS
             state = replace(state, start=first, known_from=known_from)
         ticks = np.floor_divide(t_us, tick_us).astype(np.int64) - first
-        known = state.counts.shape[1]
         end = max(int(np.floor(until_us / tick_us)) - first, known, int(ticks[-1]) + 1 if len(ticks) else 0)
         counts = np.zeros((2, end), np.int32)
         counts[:, :known] = state.counts
@@ -187,7 +182,6 @@ class CharacterDecoder:
         self, state: CharacterState, due: int, last: bool = False
     ) -> tuple[CharacterState, list[Character]]:
         """Decode the first `due` ticks, with lookahead unless they are the last ones."""
-        assert state.first is not None
         stretch, spread = self._prepare_stretch(state, due, last)
         enough = int(stretch.counts[:, :due].sum()) >= _MIN_EVENTS
         after = replace(
@@ -221,7 +215,6 @@ class CharacterDecoder:
 
     def _prepare_stretch(self, state: CharacterState, due: int, last: bool) -> tuple[Stretch, int]:
         """Return the stretch for the first `due` ticks, and over how many ticks its events are spread."""
-        assert state.first is not None
         # With the same lookahead any split of the stream gives the same result.
         counts, spread = state.counts[:, : due + self._lookahead_ticks], state.spread
         if state.light is None:
@@ -245,7 +238,6 @@ class CharacterDecoder:
         Returns:
             The state after them, the characters, and their mean quality, 1 without any.
         """
-        assert after.first is not None
         assert after.light is not None
         # The stretch is read with the light that it teaches itself.
         starts, evidence, _ = self.reader.find_path(stretch, after.light, False)

@@ -103,7 +103,7 @@ def read_characters(
     []
     """
     decoder = (Uart() if uart is None else uart).make_decoder(bit_rate_hz)
-    state, found = decoder.init(), []
+    state, found = CharacterState(), list[Character]()
     for k in range(0, len(t_us), _PIECE_EVENTS):
         t, q = (
             np.asarray(t_us[k : k + _PIECE_EVENTS], np.int64),
@@ -138,7 +138,7 @@ class _PacketFramer:
     packet: PacketFormat
 
     def init(self) -> _State:
-        return _State(self.decoder.init())
+        return _State(CharacterState())
 
     def step(self, state: _State, events: Events, until_us: int) -> tuple[_State, list[DecodedFrame]]:
         decoder, found = self.decoder.step(state.decoder, events.t_us, events.p, until_us)

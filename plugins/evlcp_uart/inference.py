@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from evlcp_sdk.clock import TimeGrain
+from evlcp_uart import _kernels
 from evlcp_uart.characters import Characters, Parity
-from evlcp_uart.light import CONTEXTS, OUTLIER, TICKS, Floats, Light, Ticks, guess_lights
+from evlcp_uart.light import CONTEXTS, TICKS, Floats, Light, Ticks, guess_lights
 
 _BAND_HZ = 250.0, 30_000.0
 """Range of rates."""
@@ -203,8 +204,7 @@ def _get_windows(counts: NDArray[np.int32]) -> Floats:
 
 def _log_likelihoods(counts: NDArray[np.int32], light: Light) -> Floats:
     """Return log-likelihoods of each context of bits that start at each tick, float64 (n, TICKS, C)."""
-    logs: Floats = np.logaddexp(light.likelihood_ratios(_get_windows(counts)), np.log(OUTLIER))
-    return logs.reshape(-1, TICKS, CONTEXTS)
+    return light.likelihood_ratios(_get_windows(counts)).reshape(-1, TICKS, CONTEXTS)
 
 
 def _decode_bits(logs: Floats) -> tuple[int, float, Floats]:
@@ -232,8 +232,6 @@ def _decode_bits(logs: Floats) -> tuple[int, float, Floats]:
 
 def _assess_format(form: Characters, rate_hz: float, idle: str, marks: Floats) -> _RatedFormat:
     """Return the evidence for a format by how likely each bit is a mark, float64 (n,)."""
-    from evlcp_uart import _kernels
-
     bits, places = form.bits, np.arange(form.data_bits)
     words = np.lib.stride_tricks.sliding_window_view(marks, bits)
     fixed = np.log(2 * words[:, bits - form.stop_bits :]).sum(1)
@@ -244,10 +242,8 @@ def _assess_format(form: Characters, rate_hz: float, idle: str, marks: Floats) -
     pause = np.log(marks)
     pause[:bits] = pause[-bits:] = 0
     scores = fixed + np.log(2 - 2 * words[:, 0]) - np.convolve(pause, np.ones(bits), "valid")
-    tails, costs = (
-        np.full(len(marks), np.log(2 - 2 * _SUCCESSIVE_SHARE)),
-        (np.log(2), -np.log(_SUCCESSIVE_SHARE), 0.0),
-    )
+    tails = np.full(len(marks), np.log(2 - 2 * _SUCCESSIVE_SHARE))
+    costs = np.log(2), -np.log(_SUCCESSIVE_SHARE), 0.0
     starts, score = _kernels.find_best_path(scores, tails, bits, 0, 0, *costs, 0, 0.0)
     stray = marks < 0.5
     stray[(starts[:, None] + np.arange(bits)).ravel()] = stray[:bits] = stray[-bits:] = False

@@ -149,7 +149,10 @@ class Light:
         return alike + over[which], np.exp(score - over[..., None]), which
 
     def likelihood_ratios(self, windows: Floats) -> Floats:
-        """Return log-likelihood ratios of windows (n, 2, TICKS) by context and as noise, float64 (n, C)."""
+        """Return log-likelihood ratios of windows (n, 2, TICKS) by context and as noise, float64 (n, C).
+
+        They are limited by outliers.
+        """
         share = self.windows / self.windows.sum()
         mean = np.einsum("c,cpt->p", share, self.rates)[:, None] / TICKS * np.ones(TICKS)
         gains = self.gains.sum(0) + _PRIOR_GAINS * _SHARES
@@ -157,7 +160,8 @@ class Light:
         flat = windows.reshape(len(windows), -1)
         alike = np.einsum("nk,k->n", flat, np.log(mean).ravel())
         score = self.share * (alike[:, None] + flat.sum(1)[:, None] * LOG_GAINS) - costs
-        return self.context_likelihoods(windows)[0] - log_sum_exp(score)[:, None]
+        ratios = self.context_likelihoods(windows)[0] - log_sum_exp(score)[:, None]
+        return np.logaddexp(ratios, np.log(OUTLIER))
 
     def mutual_information(self, windows: Floats, contexts: Floats) -> float:
         """Return the mutual information of the events (n, 2, TICKS) and contexts (n, C) of bits, nats."""
@@ -178,7 +182,7 @@ class Light:
         logs, gains, which = self.context_likelihoods(windows)
         likely = _normalize_likelihoods(logs)
         # A window that is likelier an outlier teaches nothing of a context.
-        fits = (1 - OUTLIER) * likely / likely.max(1, keepdims=True)
+        fits = (1 - OUTLIER) * likely
         contexts = contexts * fits / (fits + OUTLIER)
         at = (which[:, None] * CONTEXTS + np.arange(CONTEXTS)).ravel()
         by_events = np.bincount(at, contexts.ravel(), len(gains) * CONTEXTS).reshape(-1, CONTEXTS)

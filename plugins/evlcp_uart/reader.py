@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_uart import _kernels
 from evlcp_uart.characters import Characters
 from evlcp_uart.light import CONTEXTS, EARLY, LOG_GAINS, OUTLIER, TICKS, Floats, Light, Ticks, log_sum_exp
 
@@ -79,8 +80,6 @@ class CharacterReader:
 
     def compute_evidence(self, stretch: Stretch, light: Light) -> Floats:
         """Return log-likelihoods of the contexts of a bit at every tick, float64 (n, C), 0 for all mark."""
-        from evlcp_uart import _kernels
-
         counts = stretch.counts
         found = np.empty((counts.shape[1] - TICKS + 1, CONTEXTS))
         logs = np.ascontiguousarray(light.share * light.logs.transpose(1, 2, 0))
@@ -99,8 +98,6 @@ class CharacterReader:
 
     def _score_characters(self, evidence: Floats, light: Light, likeliest: bool) -> Floats:
         """Return the log-likelihood ratio of a character and none at every tick, float64 (n,)."""
-        from evlcp_uart import _kernels
-
         places = self.bit_offsets(light)
         scores = np.empty(max(len(evidence) - int(places[-1]), 0))
         parity = ("none", "odd", "even").index(self.characters.parity)
@@ -110,8 +107,6 @@ class CharacterReader:
     def _find_best_path(
         self, scores: Floats, evidence: Floats, stretch: Stretch, light: Light
     ) -> tuple[Ticks, float]:
-        from evlcp_uart import _kernels
-
         length = round(self.length * light.rate)
         pause = round(self.pause_bits * TICKS * light.rate)
         after_idle, after_one = light.costs

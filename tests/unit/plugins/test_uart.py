@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from evlcp_uart import _kernels
+from evlcp_uart.decoder import CharacterState
 from evlcp_uart.framing import Uart, read_characters
 from evlcp_uart.inference import infer_format
 from evlcp_uart.light import TICKS
@@ -161,7 +162,7 @@ def test_a_stream_that_begins_within_a_character_gives_none_that_was_not_sent(cu
     later = events.t_us >= cut * bit_us
     decoder = Uart(8, "even", 1).make_decoder(1e6 / bit_us)
     until_us = int(events.t_us[-1] + 3 * pause * bit_us)
-    state, found = decoder.step(decoder.init(), events.t_us[later], events.p[later], until_us)
+    state, found = decoder.step(CharacterState(), events.t_us[later], events.p[later], until_us)
     state, more = decoder.close(state)
     read = [(round(c.t_us / bit_us), c.value) for c in [*found, *more]]
     right = zip(starts, sent.tolist(), strict=True)
@@ -367,7 +368,7 @@ def test_a_light_the_other_way_round_is_read(data_bits, parity, stop_bits, bit_h
     assert Uart(data_bits, parity, stop_bits).codebook(1).codewords[sent].ravel().tolist() == levels
     events = light_of_bytes(rng, levels, bit_us, mark_on=mark_on, late_us=(40.0, 60.0), noise_hz=50.0)
     decoder = Uart(data_bits, parity, stop_bits, idle=idle).make_decoder(bit_hz)
-    state, found = decoder.step(decoder.init(), events.t_us, events.p, int(events.t_us[-1]))
+    state, found = decoder.step(CharacterState(), events.t_us, events.p, int(events.t_us[-1]))
     state, more = decoder.close(state)
     assert [c.value for c in found + more] == sent.tolist()
     assert state.tally["frames_inverted"] == (len(sent) if (idle == "on") != mark_on else 0)
