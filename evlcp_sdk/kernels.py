@@ -2,9 +2,8 @@
 
 import logging
 import shutil
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from functools import wraps
 from pathlib import Path
@@ -66,7 +65,7 @@ class CompileTimer:
                     if self._compiled_s > self._report_at_s:
                         self._report_at_s = self._compiled_s + _REPORT_EVERY_S
                         logging.getLogger(__name__).info(
-                            f"compiling kernels, once on a machine: {count_compiled()} of {count_imported()}"
+                            f"compiling kernels, once on a machine: {count_compiled()} of {len(LOADED)}"
                         )
 
         return compile_and_time
@@ -74,6 +73,9 @@ class CompileTimer:
 
 COMPILE_TIMER = CompileTimer()
 """Of this process."""
+
+LOADED: list[Any] = []
+"""The kernels that this process has loaded, those of modules of which one was called; most will be called."""
 
 
 class _Kernel:
@@ -116,6 +118,7 @@ def _create_dispatcher(function: Callable[..., Any], options: dict[str, Any]) ->
         if shutil.disk_usage(kernel.stats.cache_path).free < _MIN_FREE_BYTES:
             kernel = numba.njit(**options)(function)
     kernel.compile = COMPILE_TIMER.watch(kernel)
+    LOADED.append(kernel)
     return kernel
 
 
@@ -137,24 +140,11 @@ def njit(function: Any = None, /, **options: Any) -> Any:
     return (lambda f: _Kernel(f, all_options)) if function is None else _Kernel(function, all_options)
 
 
-def _find_kernels() -> Iterator[Any]:
-    """The kernels of modules of which one has been called."""
-    for name, module in list(sys.modules.items()):
-        if name.endswith("_kernels"):
-            values = (value for value in list(vars(module).values()) if not isinstance(value, _Kernel))
-            yield from (value for value in values if hasattr(value, "py_func"))
-
-
-def count_imported() -> int:
-    """How many kernels this process has loaded; most of them will be called."""
-    return sum(1 for _ in _find_kernels())
-
-
 def count_compiled() -> int:
     """How many kernels this process has compiled."""
-    return sum(sum(kernel.stats.cache_misses.values()) for kernel in _find_kernels())
+    return sum(sum(kernel.stats.cache_misses.values()) for kernel in LOADED)
 
 
 def find_cache_folder() -> Path | None:
     """The folder of the kernels loaded first; None where none can be written."""
-    return next((Path(k.stats.cache_path) for k in _find_kernels() if k.stats.cache_path is not None), None)
+    return next((Path(k.stats.cache_path) for k in LOADED if k.stats.cache_path is not None), None)

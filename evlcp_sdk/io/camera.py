@@ -145,7 +145,7 @@ class _CameraReader(ChunkReader):
         self._health_s = -_HEALTH_PERIOD_S
         what = "USB packets that the driver had no room for; the program was too slow"
         self.dropped = Loss(0, 0, "byte", what)
-        self._overflows = self._dropped_before = 0
+        self._overflows = 0
         self._engaged = False
         self._faults: list[Exception] = []
         self.health: dict[str, float | int | str] = {}
@@ -185,9 +185,8 @@ class _CameraReader(ChunkReader):
         if status.ring is None:
             return
         total = int(status.ring.dropped_packets)
-        if total > self._dropped_before:
-            self.dropped = self.dropped.add(total - self._dropped_before, self.bytes_read)
-        self._dropped_before = total
+        if total > self.dropped.count:
+            self.dropped = self.dropped.add(total - self.dropped.count, self.bytes_read)
         engaged = bool(status.ring.clutch_engaged)
         self._overflows += engaged and not self._engaged
         self._engaged = engaged

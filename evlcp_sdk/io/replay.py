@@ -61,14 +61,12 @@ class LoopSource(WrappingSource):
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         """As `EventSource.take`, with the times of this pass."""
-        piece = next(self._source.stream(max_events), None)
-        is_first = self._start_us is None
-        while piece is None:
+        is_first = False
+        while (piece := next(self._source.stream(max_events), None)) is None:
             if self._start_us is None or self._last_us - self._start_us >= self._for_us:
                 return None  # It is empty, or over.
             self._reopen(self._opener)
             is_first = True
-            piece = next(self._source.stream(max_events), None)
         events, triggers = piece
         first_us, last_us = span_us(events, triggers)
         if self._start_us is None:

@@ -23,7 +23,7 @@ sys.path.insert(0, sys.argv[1])
 import own_kernels
 from evlcp_sdk import kernels
 kernels.COMPILE_TIMER._report_at_s = 0.0
-print(own_kernels.twice(21), kernels.count_imported(), kernels.count_compiled())
+print(own_kernels.twice(21), len(kernels.LOADED), kernels.count_compiled())
 print(kernels.find_cache_folder())
 """
 
