@@ -1,11 +1,12 @@
 """ROS bags with `event_camera_msgs/EventPacket`, EVT3 inside: ROS 1, and ROS 2 in SQLite or MCAP."""
 
+import math
 import re
 import sqlite3
 import struct
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import chain
@@ -70,8 +71,7 @@ class BagSource(RawSource):
         target = Path(path)
         self._stack = ExitStack()
         try:
-            self._order = _PacketOrder(_read_bag(target, topic, self._stack))
-            self._packets = _PacketReader(target, iter(self._order))
+            self._packets = _PacketReader(target, _read_bag(target, topic, self._stack))
             super().__init__(target, file=self._packets)
         except BaseException:
             self._stack.close()
@@ -90,7 +90,8 @@ class BagSource(RawSource):
     @property
     def counts(self) -> dict[str, int]:
         """As `EventSource.counts`, with packets that are repeated, or out of order."""
-        found = {"packets_twice": self._order.twice, "packets_out_of_order": self._order.out_of_order}
+        packets = self._packets
+        found = {"packets_twice": packets.twice, "packets_out_of_order": packets.out_of_order}
         return super().counts | {name: count for name, count in found.items() if count}
 
     def close(self) -> None:
@@ -99,23 +100,35 @@ class BagSource(RawSource):
         self._stack.close()
 
 
-class _PacketOrder:
-    """Sorts packets by their numbers, each once; a number far below starts anew, as a driver does.
+class _PacketReader(ChunkReader):
+    """The words of a bag's packets by their numbers, each once, behind a header of their sensor.
+
+    A number far below starts anew, as a driver does.
 
     Attributes:
         twice: Number of repeated packets, which are left out.
         out_of_order: Number of packets after a later one.
+        lost: Number of missing packets.
+        first_lost: Byte at which the first is missing.
     """
 
-    def __init__(self, packets: Iterable[EventPacket]) -> None:
-        self._packets = packets
+    def __init__(self, path: Path, packets: Iterator[EventPacket]) -> None:
+        self._path = path
         self._waiting: dict[int, EventPacket] = {}
         self._past: OrderedDict[int, int] = OrderedDict()
-        self.twice = self.out_of_order = 0
+        self._next_seq: int | None = None
+        self.twice = self.out_of_order = self.lost = self.first_lost = 0
+        ordered = self._sort(packets)
+        first = next(ordered, None)
+        if first is None:
+            raise InputError(f"{path}: no packets on its topic")
+        self._packets: Iterator[EventPacket] = chain([first], ordered)
+        self._check_encoding(first)
+        super().__init__(format_header(EVT3, first.width, first.height))
 
-    def __iter__(self) -> Iterator[EventPacket]:
+    def _sort(self, packets: Iterator[EventPacket]) -> Iterator[EventPacket]:
         latest = -1
-        for packet in self._packets:
+        for packet in packets:
             digest, same = zlib.crc32(packet.data), self._waiting.get(packet.seq)
             if self._past.get(packet.seq) == digest or (same is not None and same.data == packet.data):
                 self.twice += 1
@@ -130,36 +143,14 @@ class _PacketOrder:
 
     def _pop(self) -> EventPacket:
         """Take out the packet that follows the last one, or else the first."""
-        expected = next(reversed(self._past), -1) + 1
-        near = (
-            [seq for seq in self._waiting if expected <= seq <= expected + _MAX_WAITING] if self._past else []
-        )
+        last = next(reversed(self._past), math.inf)
+        near = [seq for seq in self._waiting if last < seq <= last + 1 + _MAX_WAITING]
         packet = self._waiting.pop(min(near or self._waiting))
         self._past[packet.seq] = zlib.crc32(packet.data)
         self._past.move_to_end(packet.seq)
         if len(self._past) > _MAX_WAITING:
             self._past.popitem(last=False)
         return packet
-
-
-class _PacketReader(ChunkReader):
-    """The words of a bag's packets, behind a header of their sensor.
-
-    Attributes:
-        lost: Number of missing packets.
-        first_lost: Byte at which the first is missing.
-    """
-
-    def __init__(self, path: Path, packets: Iterator[EventPacket]) -> None:
-        self._path = path
-        self._next_seq: int | None = None
-        self.lost = self.first_lost = 0
-        first = next(packets, None)
-        if first is None:
-            raise InputError(f"{path}: no packets on its topic")
-        self._packets: Iterator[EventPacket] = chain([first], packets)
-        self._check_encoding(first)
-        super().__init__(format_header(EVT3, first.width, first.height))
 
     def read_chunk(self) -> memoryview:
         """Return the words of the next packet; none at the end."""
