@@ -516,11 +516,9 @@ def read_npy(path: Path | str) -> "NDArray[Any]":
     """
     import numpy as np
 
-    data = read_bytes(path)
-    if not data.startswith(b"\x93NUMPY"):
-        raise InputError(f"{path}: not a .npy file of plain numbers")
+    file = io.BytesIO(read_bytes(path))
     try:
-        array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
+        array: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
     except Exception as fault:
         # NumPy evaluates the header as a piece of Python, which may fail in any way.
         reason = " ".join(str(fault).split())

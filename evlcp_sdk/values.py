@@ -14,6 +14,7 @@ from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message
 from evlcp_sdk.air.kinds import MessageKind
 from evlcp_sdk.errors import StreamError, import_extra
+from evlcp_sdk.formatting import shorten
 
 if TYPE_CHECKING:
     import pandas
@@ -475,11 +476,10 @@ class ReceivedMessage:
             latitude_deg, longitude_deg, height_m = self.beacon.place
             return f"beacon at {latitude_deg:.7f}, {longitude_deg:.7f} deg, {height_m:.2f} m"
         if (text := self.message.text) is not None:
-            return repr(text if len(text) <= most else f"{text[:most]}...")
+            return repr(shorten(text, most))
         if isinstance(self.value, bytes):
             return f"{len(self.message.payload)} bytes of {self.kind.name}"
-        value = repr(self.value)
-        return f"{self.kind.name} {value if len(value) <= most else f'{value[:most]}...'}"
+        return f"{self.kind.name} {shorten(repr(self.value), most)}"
 
     def __repr__(self) -> str:
         content = f"{self.summary()} from {self.message.transmitter_id}, {self.trust}"

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
+from evlcp_sdk.formatting import shorten
 from evlcp_sdk.io.arrays import read_npy, read_npz
 from evlcp_sdk.io.columns import WINDOW_US, ColumnSource, EventTable, Piece
 from evlcp_sdk.io.fields import (
@@ -174,8 +175,7 @@ def _read_lines(file: TextIO) -> list[str]:
 
 
 def _quote_line(line: str) -> str:
-    text = line.rstrip("\n")
-    return repr(text[:60] + ("..." if len(text) > 60 else ""))
+    return repr(shorten(line.rstrip("\n"), 60))
 
 
 class _TextTable:

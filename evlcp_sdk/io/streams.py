@@ -37,7 +37,6 @@ class SocketReader(ChunkReader):
         self._socket = sock
         self._header = header
         self._datagrams = sock.type == socket.SOCK_DGRAM
-        self._first = True
         self._closed = False
         sock.settimeout(_POLL_S)
 
@@ -60,11 +59,11 @@ class SocketReader(ChunkReader):
                 if self._closed:
                     return b""
                 raise
+            is_first = not self.bytes_read
             # Some datagrams are empty, and some repeat the header.
-            if self._datagrams and (not data or (not self._first and data.startswith(b"% evt "))):
+            if self._datagrams and (not data or (not is_first and data.startswith(b"% evt "))):
                 continue
-            bare = self._first and data and not data.startswith(b"% ")
-            self._first = False
+            bare = is_first and data and not data.startswith(b"% ")
             return self._header + data if bare else data
 
     def close(self) -> None:
