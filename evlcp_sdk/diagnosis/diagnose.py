@@ -151,9 +151,8 @@ def diagnose(
     trials: tuple[Trial, ...] = ()
     is_wrong = any(one.verdict == "fail" or one.code in ("codewords", "unsure") for one in checks)
     if is_wrong and not facts.touches_edge:
-        sample = recording.sample
-        trials = tuple(recording.try_links(sample, sources, registry))
-        start = _cut_trial_events(sample)
+        trials = tuple(recording.try_links(sources, registry))
+        start = _cut_trial_events(recording.sample)
         inverted = Events(start.t_us, start.x, start.y, 1 - start.p)
         fits_inverted = not any(one.fits for one in trials) and try_link(link, inverted).fits
         checks = assess_stages(replace(facts, trials=trials, fits_inverted=fits_inverted))
@@ -187,7 +186,7 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
         if recording.has_regions and recording.is_full:
             break
     sources, _ = recording.survey.find_sources()
-    trials = recording.try_links(recording.sample, sources, registry)
+    trials = recording.try_links(sources, registry)
     return sorted(trials, key=lambda one: one.rank, reverse=True)
 
 
@@ -237,11 +236,10 @@ class _RecordingPass:
         """The events for trials of other links."""
         return Events.concat(self.pieces)[:MAX_EVENTS]
 
-    def try_links(
-        self, sample: Events, sources: Sequence[LightSource], registry: Registry
-    ) -> Iterator[Trial]:
+    def try_links(self, sources: Sequence[LightSource], registry: Registry) -> Iterator[Trial]:
         """Try links on a sample of it, the expected one first."""
-        start, fits = _cut_trial_events(sample), False
+        sample, fits = self.sample, False
+        start = _cut_trial_events(sample)
         # Changes are tried only of links whose packets have a preamble.
         if "preambles" in self.receiver.counts and sources:
             for trial in try_changes(self.link, start, registry, _candidate_rates_hz(sources, self.link)):

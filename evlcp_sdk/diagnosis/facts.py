@@ -108,7 +108,7 @@ class Facts:
         first_us, last_us: The recording's first event and its last, camera clock, us.
         lit_us: First and last time at which a transmitter's frames were due and its light was there, us, by
             its number.
-        readout: Events in each millisecond; None where they were not counted.
+        readout: Events in each millisecond.
         losses: Events and words that the source could not use.
         guessed: Missing properties of the recording that were guessed, in words; empty for none.
         step_us: Common divisor of all its times, us; 0 where it was not determined.
@@ -132,7 +132,7 @@ class Facts:
     first_us: float = math.nan
     last_us: float = math.nan
     lit_us: Mapping[int, tuple[float, float]] | None = None
-    readout: ReadoutTally | None = None
+    readout: ReadoutTally = field(default_factory=ReadoutTally)
     losses: Sequence[Loss] = ()
     guessed: str = ""
     step_us: int = 0
@@ -226,6 +226,11 @@ class Facts:
     def better_value(self, key: str) -> Any:
         """That link's value of a `table.key`; None where it is the same, or there is no such link."""
         return None if self.better_trial is None else dict(self.better_trial.changes).get(key)
+
+
+def measure_gap_px(one: tuple[float, ...], other: tuple[float, ...]) -> float:
+    """Gap between two boxes (left, top, right, bottom), across or down; 0 or less where they meet."""
+    return max(one[0] - other[2], other[0] - one[2], one[1] - other[3], other[1] - one[3])
 
 
 def has_rate(source: LightSource, rate_hz: float) -> bool:

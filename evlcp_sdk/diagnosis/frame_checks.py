@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Findings, format_ms
+from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Findings, format_ms, measure_gap_px
 from evlcp_sdk.diagnosis.tallies import SURE, TransmitterTally, count_missing_codewords
 from evlcp_sdk.formatting import format_count
 from evlcp_sdk.rx.distortion import CORRELATED_FRAMES, are_correlated
@@ -176,11 +176,9 @@ def check_reflection(_facts: Facts, one: TransmitterTally) -> Findings:
 
 def check_restart(facts: Facts, one: TransmitterTally) -> Findings:
     """A transmitter that has restarted in the place of another one."""
-    left, top, right, bottom = one.path_box_px
     for old in facts.tally.transmitters.values() if facts.counts.get("restarts") else ():
         gap_us = one.first_us - old.last_us
-        x0, y0, x1, y1 = old.path_box_px
-        moved_px = max(left - x1, x0 - right, top - y1, y0 - bottom)
+        moved_px = measure_gap_px(one.path_box_px, old.path_box_px)
         if 0 < gap_us < _RESTART_PACKETS * facts.link.packet.packet_us and moved_px < _RESTART_PX:
             time = format_ms(one.first_us - facts.first_us)
             text = f"it is transmitter {old.number}, begun anew {time} into the recording, as after a reset"

@@ -7,8 +7,15 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from evlcp_sdk.clock import TimeGrain
-from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Findings, format_ms, has_rate
+from evlcp_sdk.diagnosis.facts import (
+    BRIGHTER,
+    Diagnostic,
+    Facts,
+    Findings,
+    format_ms,
+    has_rate,
+    measure_gap_px,
+)
 from evlcp_sdk.formatting import format_count
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import find_ambiguous_links
@@ -111,7 +118,7 @@ def check_events(facts: Facts) -> Findings:
 def check_times(facts: Facts) -> Findings:
     """Times in steps of more than a quarter of a chip, and guessed properties."""
     chip_us = min(one.link.packet.chip_us for one in (facts, *facts.parts.values()))
-    grain = facts.readout.grain if facts.readout is not None else TimeGrain()
+    grain = facts.readout.grain
     step_us = max(facts.step_us, grain.step_us if grain.known_us is not None else 0)
     if step_us > chip_us / 4:
         step = "export them in whole microseconds, or with six decimals of a second; of a sensor that reads"
@@ -156,8 +163,6 @@ def check_links(facts: Facts) -> Findings:
 
 def check_readout(facts: Facts) -> Findings:
     """A readout that is at its limit."""
-    if facts.readout is None:
-        return
     events, (row_us, round_us) = facts.readout.events, facts.readout.round_us()
     share, peak = events.measure_cap()
     chip_us = min(one.link.packet.chip_us for one in (facts, *facts.parts.values()))
@@ -223,7 +228,7 @@ def _find_unread(facts: Facts) -> Diagnostic | None:
     """A source of a code without frames, beside one with frames; None where there is none."""
     link_hz = facts.link.packet.chip_rate_hz
     places = [one.path_box_px for one in facts.tally.transmitters.values()]
-    read = [one.box_px for one in facts.sources if any(_gap_px(one.box_px, at) <= 0 for at in places)]
+    read = [one.box_px for one in facts.sources if any(measure_gap_px(one.box_px, at) <= 0 for at in places)]
     for source in facts.sources:
         same_rate = has_rate(source, link_hz)
         long_px, wide_px = sorted((source.wide_px, source.high_px), reverse=True)
@@ -231,7 +236,7 @@ def _find_unread(facts: Facts) -> Diagnostic | None:
         if source.kind != "code" or source.rises < _MIN_RISES or not (same_rate or likely):
             continue
         # A bar's glow may be a little apart, and stays where the bar has been.
-        if any(_gap_px(source.box_px, other) < _GLOW_PX for other in (*read, *places)):
+        if any(measure_gap_px(source.box_px, other) < _GLOW_PX for other in (*read, *places)):
             continue
         left, top, right, bottom = source.box_px
         rate = f"{float(f'{source.rate_hz:.2g}'):g}"
@@ -243,11 +248,6 @@ def _find_unread(facts: Facts) -> Diagnostic | None:
             f"another bar? {BRIGHTER}" if same_rate else f"{other}; or light that is too weak for its chips",
         )
     return None
-
-
-def _gap_px(one: tuple[float, ...], other: tuple[float, ...]) -> float:
-    """Gap between two boxes (left, top, right, bottom), across or down; 0 or less where they meet."""
-    return max(one[0] - other[2], other[0] - one[2], one[1] - other[3], other[1] - one[3])
 
 
 def _is_lamp(source: LightSource, facts: Facts) -> bool:

@@ -270,34 +270,31 @@ class RunTally:
     def add(self, *packets: Packet) -> None:
         """Count packets and their frames."""
         for packet in packets:
-            self._add(packet)
-
-    def _add(self, packet: Packet) -> None:
-        form = self._forms[packet.link]
-        packet_us = form.packet_us
-        if packet.transmitter not in self.transmitters:
-            self.transmitters[packet.transmitter] = TransmitterTally(
-                *(packet.sent, packet_us),
-                link=packet.link,
-                number=packet.transmitter,
-                packet_chips=form.packet_chips,
-            )
-        self.transmitters[packet.transmitter].add(packet)
-        for message in packet.messages:
-            content = message.message
-            key = (content.transmitter_id, content.kind, content.sequence)
-            # A beacon's trust may change later.
-            self._messages.pop(key, None)
-            self._messages[key] = message
-            if len(self._messages) > MAX_MESSAGES:
-                self._messages.popitem(last=False)
-        end_us = packet.t_us + packet_us
-        self.covered_us += min(max(end_us - max(packet.t_us, self._until_us), 0.0), packet_us)
-        self._until_us = end_us
-        self.transmitters.move_to_end(packet.transmitter)
-        if len(self.transmitters) > _MAX_TRANSMITTERS:
-            self.dropped_transmitters += 1
-            self.dropped_frames += self.transmitters.popitem(last=False)[1].frames
+            form = self._forms[packet.link]
+            packet_us = form.packet_us
+            if packet.transmitter not in self.transmitters:
+                self.transmitters[packet.transmitter] = TransmitterTally(
+                    *(packet.sent, packet_us),
+                    link=packet.link,
+                    number=packet.transmitter,
+                    packet_chips=form.packet_chips,
+                )
+            self.transmitters[packet.transmitter].add(packet)
+            for message in packet.messages:
+                content = message.message
+                key = (content.transmitter_id, content.kind, content.sequence)
+                # A beacon's trust may change later.
+                self._messages.pop(key, None)
+                self._messages[key] = message
+                if len(self._messages) > MAX_MESSAGES:
+                    self._messages.popitem(last=False)
+            end_us = packet.t_us + packet_us
+            self.covered_us += min(max(end_us - max(packet.t_us, self._until_us), 0.0), packet_us)
+            self._until_us = end_us
+            self.transmitters.move_to_end(packet.transmitter)
+            if len(self.transmitters) > _MAX_TRANSMITTERS:
+                self.dropped_transmitters += 1
+                self.dropped_frames += self.transmitters.popitem(last=False)[1].frames
 
     def of_link(self, name: str) -> RunTally:
         """The figures of one link's transmitters."""

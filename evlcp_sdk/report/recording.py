@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 
 class EvenSample(Generic[T]):
-    """Keeps at most `limit` values of a stream, evenly spread: every value, then every second, fourth, ...
+    """Keeps at most `limit` values of a stream, an even number, evenly spread: all, then every second, ...
 
     >>> kept = EvenSample(4)
     >>> for i in range(10):
@@ -45,8 +45,7 @@ class EvenSample(Generic[T]):
             if len(self._values) == self._limit:
                 self._values = self._values[::2]
                 self._every *= 2
-            if self._seen % self._every == 0:
-                self._values.append(value)
+            self._values.append(value)
         self._seen += 1
 
     def __iter__(self) -> Iterator[T]:

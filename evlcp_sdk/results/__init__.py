@@ -6,46 +6,44 @@ from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
 
 __all__ = ["evlcp_sinks"]
 
-_OF_FRAMES = (
-    ("frames", "results.frames_csv:FramesCsv", "frames.csv", "a row per frame"),
-    ("packets", "results.packets_jsonl:PacketsJsonl", "packets.jsonl", "a line per packet or message"),
-    (
-        "points",
+_FORMATS = {
+    "frames": ("results.frames_csv:FramesCsv", "frames.csv", "a row per frame"),
+    "packets": ("results.packets_jsonl:PacketsJsonl", "packets.jsonl", "a line per packet or message"),
+    "points": (
         "results.position_tables:PointsCsv",
         "points.csv",
         "where each frame's bar is in the camera's axes",
     ),
-)
-_OF_POSITIONS = (
-    ("fixes", "results.position_tables:FixesCsv", "fixes.csv", "a row a position"),
-    (
-        *("alternatives", "results.position_tables:AlternativesCsv", "alternatives.csv"),
+    "fixes": ("results.position_tables:FixesCsv", "fixes.csv", "a row a position"),
+    "alternatives": (
+        "results.position_tables:AlternativesCsv",
+        "alternatives.csv",
         "the poses that fit where a position is refused as two do",
     ),
-    ("track", "results.position_tables:TrackCsv", "track.csv", "positions smoothed and filtered"),
-    ("geojson", "results.geojson:GeoJson", "fixes.geojson", "positions, bars and track for a map"),
-    ("nmea", "results.nmea:Nmea", "fixes.nmea", "positions as NMEA-0183"),
-)
-_PAGES = (
-    (
-        *("figures", "report.figures:Figures", "regions.png presence.png distance.png track.png"),
+    "track": ("results.position_tables:TrackCsv", "track.csv", "positions smoothed and filtered"),
+    "geojson": ("results.geojson:GeoJson", "fixes.geojson", "positions, bars and track for a map"),
+    "nmea": ("results.nmea:Nmea", "fixes.nmea", "positions as NMEA-0183"),
+    "figures": (
+        "report.figures:Figures",
+        "regions.png presence.png distance.png track.png",
         "regions, presence, distance and track as pictures",
     ),
-    (
-        *("report", "report.page:Report", "report.html"),
+    "report": (
+        "report.page:Report",
+        "report.html",
         "the recording on one page: slow motion, charts, map, messages, warnings",
     ),
-)
-"""Of each format its name, its sink in `evlcp_sdk`, its files, and a line for help."""
+}
+"""Of each format its sink in `evlcp_sdk`, its files, and a line for help."""
 
+_OF_POSITIONS = ("fixes", "alternatives", "track", "geojson", "nmea")
 _DEFAULT = ("frames", "packets", "fixes", "track", "geojson", "nmea")
-"""Those that are written by default."""
+"""Formats that are written with positions only, and those that are written by default."""
 
 
 @hookimpl
 def evlcp_sinks() -> Iterator[SinkRecord]:
     """The formats that come with the SDK."""
-    for rows in (_OF_FRAMES, _OF_POSITIONS, _PAGES):
-        for name, target, files, summary in rows:
-            default, positions = name in _DEFAULT, rows is _OF_POSITIONS
-            yield SinkRecord(name, f"evlcp_sdk.{target}", (*files.split(),), summary, default, positions)
+    for name, (target, files, summary) in _FORMATS.items():
+        default, positions = name in _DEFAULT, name in _OF_POSITIONS
+        yield SinkRecord(name, f"evlcp_sdk.{target}", (*files.split(),), summary, default, positions)

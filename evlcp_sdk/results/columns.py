@@ -8,7 +8,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Literal
 
 from evlcp_sdk.errors import ConfigError, import_extra
-from evlcp_sdk.formatting import format_or_empty
+from evlcp_sdk.formatting import format_or_empty, value_or_none
 from evlcp_sdk.values import Alternative, Fix, Frame, Packet, SoftSymbols, sigmas
 
 if TYPE_CHECKING:
@@ -96,9 +96,7 @@ def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "
     columns = {name: [frame_value(frame, name) for frame in frames] for name in names}
     if kind == "pandas":
         return import_extra("pandas", "pandas").DataFrame(columns).astype({"echo_of": "Int64"})
-    for name, values in columns.items():
-        if values and isinstance(values[0], float):
-            columns[name] = [v if math.isfinite(v) else None for v in values]
+    columns = {name: [value_or_none(v) for v in values] for name, values in columns.items()}
     table, at = import_extra("pyarrow", "parquet").table(columns), names.index("echo_of")
     # Where nothing is a reflection, the column has no type of its own.
     return table.set_column(at, "echo_of", table.column(at).cast("int64"))
