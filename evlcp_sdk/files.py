@@ -59,7 +59,7 @@ def _reading(path: Path | str) -> Iterator[None]:
 
 
 class Outputs:
-    """Files that come into place together, or not at all; a context manager that `commit` completes.
+    """Files that come into place together, or not at all; a context manager whose end is `commit`.
 
     Until then, and after a crash, earlier files stay. The file that was asked for last is the seal: while the
     others are moved into place it is missing, or, if it is JSON, says that the files are unfinished, which
@@ -213,8 +213,12 @@ class Outputs:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_fault: object) -> None:
-        self.discard()
+    def __exit__(self, fault: type[BaseException] | None, *_more: object) -> None:
+        try:
+            if fault is None:
+                self.commit()
+        finally:
+            self.discard()
 
 
 def _is_special(path: Path) -> bool:

@@ -553,10 +553,8 @@ def film(
     plan = plan_film(footage, for_ms * 1e3, slow, camera, longest_px, whole=whole)
     with open_source(recording, registry) as source:
         drawn = list(draw_film(plan, source.chunks(), footage, links))
-    with Outputs() as outputs:
-        with writing(out):
-            save_film(drawn, outputs.path(out), kind)
-        outputs.commit()
+    with Outputs() as outputs, writing(out):
+        save_film(drawn, outputs.path(out), kind)
     width, height = plan.size_px
     return {
         "film": str(out),

@@ -86,7 +86,6 @@ class SimulatedSource(EventSource):
                 outputs.write_text(text, path)
             size = outputs.path(out).stat().st_size
             outputs.write_text(json.dumps({**self.truth.table, "bytes": size}), truth_file)
-            outputs.commit()
         return (out, truth_file, *survey)
 
     @property

@@ -192,7 +192,6 @@ def _message_step(text: str, message: Message, symbols: NDArray[np.int64], link:
         outputs.write_text(
             json.dumps(symbols_table(symbols, link, messages=True)) + "\n", folder / "message.json"
         )
-        outputs.commit()
     count, size = len(symbols), len(message.payload)
     bits, chips = link.block_coder().bits * count, packet.packet_chips * count
     duration_s = round(chips / link.air.chip_rate_hz, 6)
@@ -220,7 +219,6 @@ def _light_step(light: EmulatedLight, link: Link, folder: Path) -> Step:
     with Outputs() as outputs:
         outputs.open_binary(folder / "leds.bin").write(light.record.to_bytes())
         outputs.write_array(light.chips, folder / _CHIPS)
-        outputs.commit()
     leds, chips = len(link.bar.led_clusters()), len(light.chips)
     rate_hz, on_share = round(light.rate_hz, 3), round(float(light.chips.mean()), 4)
     figures = {"leds": leds, "chips": chips, "chip_rate_hz": rate_hz, "on_share": on_share}
@@ -332,4 +330,3 @@ def _add_symbols(truth_file: Path, symbols: NDArray[np.int64], packets: int) -> 
     }
     with Outputs() as outputs:
         outputs.write_text(json.dumps(table), truth_file)
-        outputs.commit()

@@ -157,7 +157,6 @@ def _write(comparison: Comparison, paths: Sequence[Path]) -> None:
     with Outputs() as outputs:
         for path in paths:
             outputs.write_text(texts[path.suffix](), path)
-        outputs.commit()
 
 
 def _print_comparison(comparison: Comparison, paths: Sequence[Path]) -> None:

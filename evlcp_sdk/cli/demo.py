@@ -93,7 +93,6 @@ def _simulate_drive(out: Path, workers: int | None, as_json: bool) -> None:
     with Outputs() as outputs:
         save_plots(draw_charts(summary), summary.plan.name, out, outputs)
         outputs.write_text(render_campaign(summary), out / "report.html")
-        outputs.commit()
     if as_json:
         print_json(summary.to_dict())
         return

@@ -45,7 +45,6 @@ def diagnose(
 
         with Outputs() as outputs:
             outputs.write_text(render_diagnosis(diagnosis), out)
-            outputs.commit()
     if as_json:
         print_json(diagnosis.to_dict())
         return

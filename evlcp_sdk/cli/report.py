@@ -55,7 +55,6 @@ def report(
             save_plots(draw_charts(summary), summary.plan.name, folder, outputs)
         if out is not None:
             outputs.write_text(render_campaign(summary), out)
-        outputs.commit()
     if as_json:
         print_json(summary.to_dict(), 1)
     elif markdown:

@@ -78,7 +78,6 @@ def _write(surveyed: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None
 
     with Outputs() as outputs:
         outputs.open(out).write(to_toml([bar.site for bar in surveyed]))
-        outputs.commit()
     if as_json:
         bars = [
             asdict(bar.site)

@@ -44,7 +44,6 @@ def build_images(
     with Outputs() as outputs:
         for path, content in zip(paths, contents.values(), strict=True):
             outputs.open_binary(path).write(content)
-        outputs.commit()
     table = {
         "target": target,
         "address": image.address,

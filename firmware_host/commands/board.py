@@ -706,7 +706,6 @@ def leds(
     with Outputs() as outputs:
         outputs.write_array(table, chips)
         outputs.write_array(played.ticks, chips.with_suffix(".ticks.npy"))
-        outputs.commit()
     print_result(f"{len(played)} chips", {"chips": len(played), "cut_bytes": played.cut_bytes}, as_json)
     if played.cut_bytes:
         raise InputError(

@@ -222,7 +222,6 @@ def _write_files(
             outputs.write_array(symbol_chips(symbols, link), chips)
         if out is not None:
             outputs.write_text(json.dumps(table) + "\n", out)
-        outputs.commit()
 
 
 def _send_periodically(

@@ -56,7 +56,6 @@ def frames(
 
         with Outputs() as outputs:
             outputs.write_array(symbol_chips(table, link), chips)
-            outputs.commit()
     echo(_FORMATTERS[form](table, link))
 
 

@@ -98,7 +98,6 @@ class NativeBoard(Transport):
                 file = outputs.open_binary(self._flash)
                 os.fchmod(file.fileno(), mode)
                 file.write(held)
-                outputs.commit()
         self._saved_flash = held
 
 

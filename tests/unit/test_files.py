@@ -55,7 +55,6 @@ def test_what_cannot_be_read_is_one_line(read, name, content, message, tmp_path)
 def write_text(text: str, path: Path) -> None:
     with Outputs() as outputs:
         outputs.write_text(text, path)
-        outputs.commit()
 
 
 def test_an_earlier_file_stays_until_the_new_one_is_whole(tmp_path, monkeypatch) -> None:
@@ -68,7 +67,6 @@ def test_an_earlier_file_stays_until_the_new_one_is_whole(tmp_path, monkeypatch)
     with Outputs() as outputs:
         outputs.path(path).write_text("new")
         assert path.read_text() == "old"
-        outputs.commit()
     # A death just before it comes into place leaves the earlier one, too.
     monkeypatch.setattr(Path, "replace", Mock(side_effect=KeyboardInterrupt))
     with suppress(KeyboardInterrupt):
@@ -108,11 +106,12 @@ def test_links_are_neither_followed_nor_replaced(tmp_path: Path, dangling: bool)
     assert victim.exists() is not dangling
     with pytest.raises(OutputError, match=r"a\.txt: exists; a key is not overwritten"):
         write_secret(b"x", link)
-    with Outputs() as outputs:
-        outputs.write_text("x", tmp_path / "b.txt")
-        (tmp_path / "b.txt").symlink_to(victim)
-        with pytest.raises(OutputError, match=r"b\.txt: cannot be written: it is a link"):
-            outputs.commit()
+    outputs = Outputs()
+    outputs.write_text("x", tmp_path / "b.txt")
+    (tmp_path / "b.txt").symlink_to(victim)
+    with pytest.raises(OutputError, match=r"b\.txt: cannot be written: it is a link"):
+        outputs.commit()
+    outputs.discard()
     assert (tmp_path / "b.txt").is_symlink()
     assert dangling or victim.read_text() == "mine"
 
@@ -140,7 +139,6 @@ def test_a_death_between_two_renames_leaves_a_mark(tmp_path, step, seal, monkeyp
             for name in names:
                 outputs.write_text(json.dumps(text), tmp_path / name)
             outputs.drop(tmp_path / "old.csv")
-            outputs.commit()
 
     (tmp_path / "old.csv").write_text("old")
     write("A")
