@@ -101,18 +101,23 @@ _WARM_PACKETS = 2
 """Packets that a variant decodes beforehand: with two, one is whole, so that every kernel is loaded."""
 
 
-class _StageTimer:
-    """Collects the processor time of the stages of each frame, us, and views of frames.
+class _VariantRun:
+    """Receives with a variant, as the plugin that collects views, and the processor time of stages, us.
 
     A stage's time is that since the stage before finished, on the clock of the thread's processor, or on the
     wall clock where that is less: between two frames, work of other stages precedes the first.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, links: Mapping[str, Link]) -> None:
         self.frames_us: list[dict[str, float]] = []
         self.views: list[FrameView] = []
         self._frame: dict[str, float] = {}
         self._finished_s = time.thread_time()
+        self.links = links
+        self.receiver = Receiver([*links.values()], Registry.load(self).hook)
+        self.frames: list[FrameRow] = []
+        self.packets = 0
+        self.spent = Stopwatch()
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any, elapsed_s: float) -> None:
@@ -125,16 +130,6 @@ class _StageTimer:
         elif stage == "view":
             self.views.append(value)
         self._finished_s = time.thread_time()
-
-
-class _VariantRun:
-    def __init__(self, links: Mapping[str, Link]) -> None:
-        self.timer = _StageTimer()
-        self.links = links
-        self.receiver = Receiver([*links.values()], Registry.load(self.timer).hook)
-        self.frames: list[FrameRow] = []
-        self.packets = 0
-        self.spent = Stopwatch()
 
     def feed(self, events: Events | None) -> None:
         """Receive events; None ends the stream."""
@@ -151,7 +146,7 @@ class _VariantRun:
             several = self.links if len(self.links) > 1 else None
             counted = statistics_of(self.frames, truth, packets=self.packets, links=several)
         cpu_s = reading_s + self.spent.processor_s
-        return Measurement({name: counted}, tuple(self.timer.frames_us), recorded_s, cpu_s)
+        return Measurement({name: counted}, tuple(self.frames_us), recorded_s, cpu_s)
 
 
 def compare_recording(
@@ -193,9 +188,9 @@ def compare_recording(
                 run.feed(events)
             # Bounds are computed while no receiver's time runs.
             if bound is not None:
-                bounds_m += [bound(view).sigma_m for view in runs[0].timer.views]
+                bounds_m += [bound(view).sigma_m for view in runs[0].views]
             for run in runs:
-                run.timer.views.clear()
+                run.views.clear()
             advance(source.position_bytes, source.size_bytes)
     recorded_s = max(float(last_us - first_us), 0.0) * 1e-6
     rows = {

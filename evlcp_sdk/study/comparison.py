@@ -217,17 +217,10 @@ class Table:
 
         A column in which fewer than two rows have a figure has no best.
         """
-        best_keys: list[set[str]] = [set() for _ in self.rows]
-        for column in COLUMNS:
-            if column.best is None:
-                continue
-            ranks = [column.rank(measured) for measured in self.rows.values()]
-            finite = [rank for rank in ranks if not math.isnan(rank)]
-            if len(finite) > 1:
-                for keys, rank in zip(best_keys, ranks, strict=True):
-                    if rank == min(finite):
-                        keys.add(column.key)
-        return tuple(map(frozenset, best_keys))
+        ranked = [column for column in COLUMNS if column.best is not None]
+        ranks = np.array([[column.rank(measured) for column in ranked] for measured in self.rows.values()])
+        is_best = (ranks == np.fmin.reduce(ranks)) & (np.isfinite(ranks).sum(0) > 1)
+        return tuple(frozenset(c.key for c, best in zip(ranked, row, strict=True) if best) for row in is_best)
 
     def list_columns(self) -> list["Column"]:
         """List the columns in which any row has a figure."""
