@@ -122,16 +122,12 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
     return Processes(workers or os.cpu_count() or 1)
 
 
-def can_show_bars() -> bool:
-    """Whether stderr may be a terminal; asked before Rich, which loads slowly, is imported."""
-    forced = os.environ.get("FORCE_COLOR") or os.environ.get("TTY_COMPATIBLE")
-    return bool(forced) or (sys.stderr is not None and sys.stderr.isatty())
-
-
 @contextmanager
 def progress_bar(name: str, *, by_bytes: bool = False) -> "Iterator[Callable[..., None]]":
     """A bar on stderr, on a terminal only; gives a function of the amount done, the total, and a text."""
-    if not can_show_bars():
+    forced = os.environ.get("FORCE_COLOR") or os.environ.get("TTY_COMPATIBLE")
+    # Rich, which would know, loads slowly.
+    if not forced and not (sys.stderr is not None and sys.stderr.isatty()):
         yield lambda _done, _total, _words="": None
         return
     from rich import progress

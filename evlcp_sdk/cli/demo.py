@@ -15,20 +15,10 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.study.summary import Summary
 
-DEMO_NAME = "night-50m-30kmh-cut"
 CAMPAIGN_NAME = "demo"
 
 _WARM_UP_S = 0.06
 """Length of a first run that compiles the kernels: a packet at least."""
-
-
-def demo_files() -> tuple[Path, Path]:
-    """The demo's recording and its truth: in the wheel, or in a checkout's `examples/recordings`."""
-    from evlcp_sdk.files import find_shipped_file
-    from evlcp_sdk.sim.truth import truth_path
-
-    raw = find_shipped_file("recordings", f"{DEMO_NAME}.raw")
-    return raw, truth_path(raw)
 
 
 def demo_campaign() -> Path:
@@ -140,17 +130,19 @@ def print_drive(summary: Summary) -> None:
 
 def _decode_recording(out: Path, as_json: bool) -> None:
     from evlcp_sdk.cli._summary import print_summary
+    from evlcp_sdk.files import find_shipped_file
     from evlcp_sdk.run import receive_to_folder
-    from evlcp_sdk.sim.truth import read_truth
+    from evlcp_sdk.sim.truth import read_truth, truth_path
     from evlcp_sdk.study.frames import read_frames
     from evlcp_sdk.study.score import score_frames
 
-    recording, truth_file = demo_files()
+    # In the wheel, or in a checkout's examples/recordings.
+    recording = find_shipped_file("recordings", "night-50m-30kmh-cut.raw")
     if not as_json:
         console().print(f"decoding {recording.name} ...", style="dim")
     summary = receive_to_folder(recording, out, sinks=["figures"])
     # The written rows, as `evlcp score` reads them.
-    score = score_frames(read_frames(out), read_truth(truth_file))
+    score = score_frames(read_frames(out), read_truth(truth_path(recording)))
     if as_json:
         print_json(summary | {"score": score})
         return

@@ -108,11 +108,8 @@ def _render(
 ) -> None:
     import time
 
-    from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.simulated import simulate as render
 
-    if out.suffix != ".raw":
-        raise ConfigError(f"{out}: a recording is written as NAME.raw")
     simulated = render(source, seed, link=link, overrides=overrides, threads=threads)
     scene = simulated.scene
     start_s = time.perf_counter()

@@ -6,7 +6,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.live.publisher import Publisher
@@ -21,36 +21,8 @@ _JOIN_S = 2.0
 """Longest wait at the end of a run for the loop's thread."""
 
 
-class LoopThread:
-    """An event loop in a thread of its own; a context manager, whose end cancels its tasks."""
-
-    def __init__(self) -> None:
-        self.loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._run, name="evlcp-loop", daemon=True)
-
-    def call(self, job: Coroutine[Any, Any, _T]) -> _T:
-        """Run a coroutine in the loop; return its result, or raise its exception."""
-        return asyncio.run_coroutine_threadsafe(job, self.loop).result()
-
-    def finish(self, task: "asyncio.Task[None]") -> None:
-        """Wait until a task is done, for `FINISH_S` at most."""
-        self.call(asyncio.wait([task], timeout=FINISH_S))
-
-    def _run(self) -> None:
-        with asyncio.Runner(loop_factory=lambda: self.loop) as runner:
-            runner.get_loop().run_forever()
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_fault: object) -> None:
-        self.loop.call_soon_threadsafe(self.loop.stop)
-        self._thread.join(_JOIN_S)
-
-
 class Server(ABC):
-    """A server of a run's results, in the loop of a `LoopThread`.
+    """A server of a run's results, in the event loop of `serve`.
 
     Args:
         publisher: Gives the results.
@@ -140,11 +112,28 @@ def serve(
     Raises:
         ConfigError: A port cannot be used, or a package is not installed.
     """
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=_run_loop, args=(loop,), name="evlcp-loop", daemon=True)
+    thread.start()
     with ExitStack() as stack:
-        loop_thread = stack.enter_context(LoopThread())
+        stack.callback(thread.join, _JOIN_S)
+        stack.callback(loop.call_soon_threadsafe, loop.stop)
         for server in servers:
-            stack.callback(loop_thread.finish, loop_thread.call(server.start()))
+            task = _call(loop, server.start())
+            # So long, a server may send the rest.
+            stack.callback(_call, loop, asyncio.wait([task], timeout=FINISH_S))
         stack.callback(publisher.close)
         if recorder is not None:
             stack.callback(recorder.close)
         yield
+
+
+def _run_loop(loop: asyncio.AbstractEventLoop) -> None:
+    """Run an event loop until it is stopped, and cancel its tasks."""
+    with asyncio.Runner(loop_factory=lambda: loop) as runner:
+        runner.get_loop().run_forever()
+
+
+def _call(loop: asyncio.AbstractEventLoop, job: Coroutine[Any, Any, _T]) -> _T:
+    """Run a coroutine in the loop; return its result, or raise its exception."""
+    return asyncio.run_coroutine_threadsafe(job, loop).result()
