@@ -224,7 +224,7 @@ def guess_lights(counts: NDArray[np.int32], mark_on: bool) -> Iterator[Light]:
                     for context in range(CONTEXTS):
                         bits = [
                             bit if mark_on else 1 - bit
-                            for bit in (context >> 2, context >> 1 & 1, context & 1)
+                            for bit in (context >> 2 & 1, context >> 1 & 1, context & 1)
                         ]
                         rates[context, on] = noise[on]
                         if bits[2] == on and bits[1] != on:
