@@ -13,7 +13,7 @@ from evlcp_sdk.formatting import suggest
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.gnss import GnssLog, add_heading, to_camera_fix
-from evlcp_sdk.place.positioner import BarKind, Positioner
+from evlcp_sdk.place.positioner import Positioner
 from evlcp_sdk.place.trajectory import (
     GNSS,
     IMU,
@@ -227,17 +227,10 @@ class Navigator:
         links = {"": links} if isinstance(links, Link) else links
         link = next(iter(links.values()))
         self._spec = ErrorModel.of(link.position)
-        self.positioner = Positioner(
-            link.camera,
-            {name: BarKind.of(one) for name, one in links.items()},
-            plan.sites,
-            attitude_source(attitude),
-            self._spec,
-            link.camera_sigma,
-        )
+        self._attitude_at = attitude_source(attitude)
+        self.positioner = Positioner(links, plan.sites, self._attitude_at)
         self._log = attitude if isinstance(attitude, AttitudeLog) else None
         self._imu = None if self._log is None else self._log.motion_between
-        self._attitude_at = attitude_source(attitude)
         self._gnss, self._gnss_next = plan.gnss, 0
         self._span: tuple[float, float] | None = None
         self._last_used_us: dict[str, float] = {}

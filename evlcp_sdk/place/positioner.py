@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,49 +11,31 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.bar_registry import BarRegistry
-from evlcp_sdk.place.error_model import DEFAULT_ERRORS, EXACT_CAMERA, ErrorModel
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView, Rejection
 from evlcp_sdk.place.points import interpolate_points
 from evlcp_sdk.place.pose import search_focal_mm, solve_pose
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Alternative, Fix, Frame, Packet
 
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class BarKind:
-    """The bars of one link, whose name may be empty."""
-
-    bar: BarLayout
-    packet_us: float
-    link: str = ""
-
-    @classmethod
-    def of(cls, link: Link) -> "BarKind":
-        """The bars of a link."""
-        return cls(link.bar, link.packet.packet_chips * link.packet.chip_us, link.name)
-
-
 class Positioner:
     """Fixes on a fixed time grid, one per packet time, from the packets of a receiver.
 
-    With several kinds of bars, the longest packets make the grid; bars of all kinds enter one fix. A fix
-    takes the bars that are seen within half a packet time before and after it. The image moves in that time,
-    with the vehicle's vibration, but a bar's shape hardly changes: the shape is a straight line in time
-    through all frames, the place is interpolated between the frames next to the fix. Feeding packet by packet
-    or all at once gives the same fixes. Reflections are left out.
+    With several links, the longest packets make the grid; bars of all of them enter one fix. A fix takes the
+    bars that are seen within half a packet time before and after it. The image moves in that time, with the
+    vehicle's vibration, but a bar's shape hardly changes: the shape is a straight line in time through all
+    frames, the place is interpolated between the frames next to the fix. Feeding packet by packet or all at
+    once gives the same fixes. Reflections are left out.
 
     Args:
-        camera: The receiving camera.
-        kinds: The kinds of bars, by the name of their packets' link; packets of others are left out.
+        links: The links of the bars, by the name in their packets, with one camera and one `[position]`;
+            packets of others are left out.
         sites: Where the bars stand; may be empty where beacons are accepted.
         attitude_at: The camera's attitude at a time, us, as far as it is known; None if it is not.
-        spec: Bounds and weights.
-        camera_sigma: How precisely the camera is known.
 
     Attributes:
         axes: The local axes; None as long as no place is known.
@@ -62,22 +44,18 @@ class Positioner:
 
     def __init__(
         self,
-        camera: CameraModel,
-        kinds: Mapping[str, BarKind],
+        links: Mapping[str, Link],
         sites: Sequence[BarSite],
         attitude_at: Callable[[float], Attitude | None],
-        spec: ErrorModel = DEFAULT_ERRORS,
-        camera_sigma: CameraSigma = EXACT_CAMERA,
     ) -> None:
         self.axes: LocalAxes | None = LocalAxes.of(sites) if sites else None
-        self._camera = camera
-        self._camera_sigma = camera_sigma
-        self._kinds = dict(kinds)
-        self._packet_us = max(kind.packet_us for kind in self._kinds.values())
+        self._links = dict(links)
+        link = next(iter(links.values()))
+        self._camera, self._camera_sigma = link.camera, link.camera_sigma
+        self._packet_us = max(one.packet.packet_us for one in links.values())
         self._attitude_at = attitude_at
-        self._spec = spec
-        only = next(iter(self._kinds.values())).link if len(self._kinds) == 1 else ""
-        self.bars = BarRegistry(sites, self._spec, only)
+        self._spec = ErrorModel.of(link.position)
+        self.bars = BarRegistry(sites, self._spec, link.name if len(links) == 1 else "")
         self._frames: dict[int, list[Frame]] = {}
         self._next: int | None = None
         self._contradiction: tuple[list[BarView], Attitude | None] | None = None
@@ -99,15 +77,15 @@ class Positioner:
         """Process the next packets; return the fixes that no later packet can change."""
         fixes = []
         for packet in packets:
-            if packet.link not in self._kinds:
+            if packet.link not in self._links:
                 continue
             self.bars.add_packet(packet)
             if packet.echo_of is not None:
                 # Its earlier frames are of a reflection, too.
                 self._frames.pop(packet.transmitter, None)
-            clusters = self._kinds[packet.link].bar.clusters
+            link = self._links[packet.link]
             for frame in packet.frames if packet.echo_of is None else ():
-                if len(frame.points_px) != clusters or not np.isfinite(frame.points_t_us):
+                if len(frame.points_px) != link.bar.clusters or not np.isfinite(frame.points_t_us):
                     continue
                 number = math.ceil(frame.points_t_us / self._packet_us - 0.5)
                 if self._next is None:
@@ -117,7 +95,7 @@ class Positioner:
                 self._frames.setdefault(packet.transmitter, []).append(frame)
             # A packet of another bar that starts half a packet after a fix is complete one packet later;
             # longer packets that are not yet complete have begun earlier than this one.
-            earlier = 1 - self._kinds[packet.link].packet_us / self._packet_us
+            earlier = 1 - link.packet.packet_us / self._packet_us
             fixes += self._compute_until(packet.t_us / self._packet_us - 1.5 - earlier)
         return fixes
 
@@ -153,9 +131,9 @@ class Positioner:
         views, placed, unplaced = [], [], []
         bar_axes: LocalAxes | None = None
         for number, frames in sorted(self._frames.items()):
-            kind = self._kinds[self.bars.link_of(number)]
-            layout_m = kind.bar.cluster_positions_m()
-            view = interpolate_points(number, frames, t_us, kind.packet_us, layout_m, self._spec)
+            link = self._links[self.bars.link_of(number)]
+            layout_m = link.bar.cluster_positions_m()
+            view = interpolate_points(number, frames, t_us, link.packet.packet_us, layout_m, self._spec)
             if view is None:
                 continue
             views.append(number)
@@ -166,7 +144,7 @@ class Positioner:
             bar_axes = bar_axes or LocalAxes.of([site])
             self.axes = self.axes or bar_axes
             try:
-                enu = site.layout_positions_m(kind.bar, bar_axes)
+                enu = site.layout_positions_m(link.bar, bar_axes)
                 placed.append(replace(view, enu_m=enu, survey_sigmas=site.survey_sigmas))
             except ConfigError as error:
                 unplaced.append(str(error))

@@ -13,12 +13,13 @@ from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.kinds import BeaconKind
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.place.bar_registry import BarRegistry
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import Candidate, Rejection, project_bars
-from evlcp_sdk.place.positioner import BarKind, Positioner, _to_alternatives
+from evlcp_sdk.place.positioner import Positioner, _to_alternatives
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedRing
+from evlcp_sdk.scene.bar import BarLayout, LedRing
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Packet, ReceivedMessage, Trust
@@ -62,8 +63,8 @@ def merge(*streams: list[Packet]) -> list[Packet]:
 
 
 def positioner(sites, attitude=EXACT, layout=BAR, link="", **spec: Any) -> Positioner:
-    kinds = {"": BarKind(layout, PACKET_US, link)}
-    return Positioner(CAMERA, kinds, sites, lambda _t: attitude, ErrorModel(**spec))
+    links = {"": dataclasses.replace(resolve({"bar": layout.to_table(), "position": spec}), name=link)}
+    return Positioner(links, sites, lambda _t: attitude)
 
 
 def fixes_of(p: Positioner, packets: list[Packet]) -> list[Fix]:
@@ -97,28 +98,28 @@ LEFT, RIGHT = site(7, (-2.0, 0.0, 0.0), 0), site(9, (2.0, -6.0, 0.0), 1)
 
 def test_bars_of_two_links_give_one_fix() -> None:
     """A bar of 16 clusters, and one of half the length, of eight, whose packets are longer."""
-    short = BarLayout(LedGrid(rows=48))
+    short = resolve({"bar": {"rows": 48}, "air": {"frames_per_packet": 13}})
     right = dataclasses.replace(RIGHT, length_m=0.48, transmitter_id=7, link="short")
     left = dataclasses.replace(LEFT, link="long")
     gravity = Attitude(4.0, 1.0, None, 0.0)
-    kinds = {"long": BarKind(BAR, PACKET_US, "long"), "short": BarKind(short, 1.3 * PACKET_US, "short")}
+    links = {"long": resolve({}), "short": short}
     one, lamp = packets_of(LEFT, 0, 8, link="long"), packets_of(LEFT, 2, 8, link="lamp")
     other = packets_of(right, 1, 8, enu=right.cluster_positions_m(8, ORIGIN), link="short")
-    p = Positioner(CAMERA, kinds, [right, left], lambda _t: gravity)
+    p = Positioner(links, [right, left], lambda _t: gravity)
     fixes = fixes_of(p, merge(one, other, lamp))
     assert_right(fixes)
     assert [fix.transmitters for fix in fixes] == [(0, 1)] * len(fixes)
     assert p.links_of(fixes[0]) == "long short"
     assert p.counts["frames_late"] == 0
     # The longest packets make the grid.
-    assert np.diff([fix.t_us for fix in fixes]) == pytest.approx(1.3 * PACKET_US)
+    assert np.diff([fix.t_us for fix in fixes]) == pytest.approx(short.packet.packet_us)
     # The same fixes, packet by packet.
-    again = Positioner(CAMERA, kinds, [right, left], lambda _t: gravity)
+    again = Positioner(links, [right, left], lambda _t: gravity)
     pieces = [fix for packet in merge(one, other, lamp) for fix in again.feed([packet])] + again.close()
     assert [fix.enu_m.tolist() for fix in pieces] == [fix.enu_m.tolist() for fix in fixes]
     # Both have the number of the site, which names neither: each bar is where its own link stands.
     elsewhere = dataclasses.replace(left, link="short", transmitter=0)
-    alone = fixes_of(Positioner(CAMERA, kinds, [elsewhere], lambda _t: gravity), one)
+    alone = fixes_of(Positioner(links, [elsewhere], lambda _t: gravity), one)
     assert {fix.refusal for fix in alone} == {"no-site"}
 
 
