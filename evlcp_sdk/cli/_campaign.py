@@ -1,10 +1,8 @@
-"""The display of a running campaign: a bar, and the failed jobs."""
+"""The display of a running campaign: its progress, and the failed jobs."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from evlcp_sdk.cli._common import progress_bar
 from evlcp_sdk.cli._stderr import print_stderr
 
 if TYPE_CHECKING:
@@ -23,14 +21,8 @@ def print_faults(progress: "Progress") -> None:
         print_stderr(f"{len(lines) - _MAX_FAULTS} more kinds of failure")
 
 
-@contextmanager
-def campaign_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
-    """A bar by tasks, with the errors so far; on a terminal only."""
-    with progress_bar(name) as advance:
-
-        def show(progress: "Progress") -> None:
-            failed = f", {len(progress.faults)} failed" if progress.faults else ""
-            errors = f": {progress.bit_errors:,} errors in {progress.bits:,} bits" if progress.bits else ""
-            advance(progress.done, progress.tasks, f"{progress.done}/{progress.tasks}{errors}{failed}")
-
-        yield show
+def show_progress(advance: Callable[..., None], progress: "Progress") -> None:
+    """Advance a bar by tasks, with the errors so far."""
+    failed = f", {len(progress.faults)} failed" if progress.faults else ""
+    errors = f": {progress.bit_errors:,} errors in {progress.bits:,} bits" if progress.bits else ""
+    advance(progress.done, progress.tasks, f"{progress.done}/{progress.tasks}{errors}{failed}")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, Workers, console, print_json
+from evlcp_sdk.cli._campaign import print_faults, show_progress
+from evlcp_sdk.cli._common import Json, Workers, console, make_executor, print_json, progress_bar
 from evlcp_sdk.cli._tables import print_table
 
 if TYPE_CHECKING:
@@ -50,10 +53,6 @@ def demo(
 
 
 def _simulate_drive(out: Path, workers: int | None, as_json: bool) -> None:
-    from dataclasses import replace
-
-    from evlcp_sdk.cli._campaign import campaign_bar, print_faults
-    from evlcp_sdk.cli._common import make_executor
     from evlcp_sdk.files import Outputs, writing
     from evlcp_sdk.report.drawing import save_plots
     from evlcp_sdk.study.collect import collect_results
@@ -71,11 +70,13 @@ def _simulate_drive(out: Path, workers: int | None, as_json: bool) -> None:
     for name in (results, *(results.with_name(results.name + end) for end in ("-wal", "-shm"))):
         name.unlink(missing_ok=True)
     with Store(results, create=True) as store:
-        with campaign_bar(plan.name) as show_progress:
+        with progress_bar(plan.name) as advance:
             # Compile here, once and visibly, rather than in each worker.
             job = plan.jobs[0]
             run_job(replace(job, scene=replace(job.scene, duration_s=_WARM_UP_S)))
-            progress = collect_results(plan, store, make_executor(workers, None), run_job, show_progress)
+            progress = collect_results(
+                plan, store, make_executor(workers, None), run_job, partial(show_progress, advance)
+            )
         summary = summarize(store)
     print_faults(progress)
     if progress.faults:

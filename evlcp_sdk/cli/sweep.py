@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._campaign import campaign_bar, print_faults
-from evlcp_sdk.cli._common import Dask, Json, Workers, console, make_executor, print_json
+from evlcp_sdk.cli._campaign import print_faults, show_progress
+from evlcp_sdk.cli._common import Dask, Json, Workers, console, make_executor, print_json, progress_bar
 
 if TYPE_CHECKING:
     from evlcp_sdk.study.collect import Progress
@@ -66,8 +67,10 @@ def sweep(
         executor = make_executor(workers, dask)
         with Store(path, create=True) as store:
             try:
-                with campaign_bar(plan.name) as show:
-                    progress = collect_results(plan, store, executor, run_job, show)
+                with progress_bar(plan.name) as advance:
+                    progress = collect_results(
+                        plan, store, executor, run_job, partial(show_progress, advance)
+                    )
             except KeyboardInterrupt:
                 progress = progress_of(plan, store.read_results())
                 done = f"{progress.done} of {progress.tasks} tasks are in {path}"
