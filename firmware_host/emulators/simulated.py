@@ -22,7 +22,7 @@ class _Health(ctypes.Structure):
 
 
 class Bench(ctypes.Structure):
-    """A board's outputs and settings for tests: `struct native_bench` of `hal/native/board.h`."""
+    """A board's outputs and settings for tests: `struct native_bench` of `hal/native/board.c`."""
 
     _fields_: ClassVar = [
         ("output", ctypes.c_void_p),

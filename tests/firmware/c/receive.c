@@ -1,9 +1,7 @@
 /* libFuzzer: any bytes on the line, and any payloads in good datagrams, leave the board sound.
 
    The first byte chooses: raw bytes, or a sequence of (type, length, payload) sent as good datagrams. */
-#include <string.h>
-
-#include "board.h"
+#include "board.c"
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
