@@ -130,7 +130,7 @@ def run_loop(
     distance_m: float = 50.0,
     seed: int = 0,
     sinks: Sequence[str] = (),
-    progress: Progress = lambda _, __: None,
+    progress: Progress = lambda *_: None,
 ) -> Iterator[Step]:
     """Send a text by an emulated board to a simulated camera, and read it; yield each step when it is done.
 

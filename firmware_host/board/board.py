@@ -296,7 +296,9 @@ class Board:
                 return f"{name} = {getattr(status, name)}, expected {value}"
         return None
 
-    def program(self, content: Bank, verify: bool = True, progress: Progress | None = None) -> ProgramResult:
+    def program(
+        self, content: Bank, verify: bool = True, progress: Progress = lambda *_: None
+    ) -> ProgramResult:
         """Write a bank's content to the board and activate it; blocks that the board has are not sent.
 
         A board that plays goes on with the old bank until the new one is complete and checked, and swaps
@@ -332,7 +334,7 @@ class Board:
                     f"{self.session.name}: bank {status.active_bank} is active, expected {bank};"
                     " program it again"
                 )
-        elif progress:
+        else:
             progress(total, total)
         return ProgramResult(
             written=written,
@@ -478,7 +480,7 @@ class Board:
                 f" send at most {room // bank.packet_bytes} packets"
             )
 
-    def write_missing(self, bank: int, content: bytes, progress: Progress | None = None) -> int:
+    def write_missing(self, bank: int, content: bytes, progress: Progress = lambda *_: None) -> int:
         """Write the blocks that a spare bank lacks; return the bytes written.
 
         On a noisy line a piece that gets no answer is halved.
@@ -489,8 +491,7 @@ class Board:
         missing = self._find_missing(bank, content)
         total = sum(n for _, n in missing)
         done = len(content) - total
-        if progress is not None:
-            progress(done, len(content))
+        progress(done, len(content))
         piece_bytes = self.session.max_payload - protocol.WriteRequest.min_bytes()
         queue = deque((at, at + n) for at, n in missing)
 
@@ -511,8 +512,7 @@ class Board:
                 return
             self.session.expect_reply(request, outcome)
             done += n
-            if progress is not None:
-                progress(done, len(content))
+            progress(done, len(content))
 
         while queue:
             self.session.run(requests(), handle)
@@ -558,7 +558,7 @@ class Board:
 
 
 def provision(
-    board: Board, bank: Bank, settings: Settings, verify: bool = True, progress: Progress | None = None
+    board: Board, bank: Bank, settings: Settings, verify: bool = True, progress: Progress = lambda *_: None
 ) -> ProgramResult:
     """Set a board's bank and settings, as far as they differ.
 

@@ -116,7 +116,7 @@ def confirm_update(board: Board) -> None:
 def update_firmware(
     board: Board,
     package: UpdatePackage,
-    progress: Progress | None = None,
+    progress: Progress = lambda *_: None,
     keep: bool = True,
     wait_s: float = 10.0,
 ) -> UpdateResult:
@@ -156,8 +156,7 @@ def update_firmware(
     def handle(request: protocol.UpdateWriteRequest, _: protocol.UpdateWriteReply) -> None:
         nonlocal done
         done += len(request.data)
-        if progress is not None:
-            progress(done, len(data))
+        progress(done, len(data))
 
     pieces = (protocol.UpdateWriteRequest(at, data[at : at + piece]) for at in range(0, len(data), piece))
     try:

@@ -199,7 +199,7 @@ def flash_image(
     image: FlashImage,
     verify: bool = True,
     start: bool = True,
-    progress: Progress | None = None,
+    progress: Progress = lambda *_: None,
 ) -> list[int]:
     """Erase the sectors of an image, write it, read it back, and run it; return the sectors.
 
@@ -224,12 +224,10 @@ def flash_image(
     loader.erase(sectors)
     for transfer in (loader.write, loader.verify)[: 1 + verify]:
         for at, piece in pieces:
-            if progress is not None:
-                progress(done, total)
+            progress(done, total)
             transfer(at, piece)
             done += len(piece)
-    if progress is not None:
-        progress(done, total)
+    progress(done, total)
     if start:
         loader.run_program(image.address)
     return sectors
