@@ -2,7 +2,6 @@
 
 from bisect import insort
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 from itertools import takewhile
 from types import TracebackType
 from typing import Self
@@ -23,19 +22,6 @@ DEFAULT_AHEAD = 4
 
 _PIECE_OVERHEAD = PushRequest.min_bytes()
 _DARK_S = 10.0
-
-
-@dataclass(frozen=True, order=True)
-class _Piece:
-    number: int
-    offset: int
-    data: bytes = field(compare=False)
-    ends: bool = field(compare=False)
-
-    @property
-    def after(self) -> tuple[int, int]:
-        """The board's position in the queue after this piece."""
-        return (self.number + 1, 0) if self.ends else (self.number, self.offset + len(self.data))
 
 
 class Stream:
@@ -74,8 +60,8 @@ class Stream:
         self._piece_bytes = session.max_payload - _PIECE_OVERHEAD
         self._retries = session.client.retries
         self._submitted = 0
-        self._pieces: list[_Piece] = []
-        self._in_flight: dict[int, tuple[_Piece | None, PushRequest]] = {}
+        self._pieces: list[PushRequest] = []
+        self._in_flight: dict[int, PushRequest] = {}
         self._position = (0, 0)
         self.packet_s = template.link.packet.packet_chips / template.chip_rate_hz
         self._last_reply_s = session.transport.time_s()
@@ -170,7 +156,7 @@ class Stream:
         number = self._next_number
         for at in range(0, len(content), self._piece_bytes):
             data = content[at : at + self._piece_bytes]
-            self._pieces.append(_Piece(number, at, data, at + len(data) == len(content)))
+            self._pieces.append(PushRequest(self._bank, number, at, 0, data))
         return number
 
     def wait(self, seconds: float) -> None:
@@ -187,7 +173,7 @@ class Stream:
             self._exchange(self._pulse_s)
         if self._position != (self._next_number, 0):
             raise LineError(f"{self._session.name}: the board's queue lost a packet; send it again")
-        self._submit(None, PushRequest(self._bank, self._next_number, 0, 1, b""))
+        self._submit(PushRequest(self._bank, self._next_number, 0, 1, b""))
         while self._in_flight:
             self._exchange(self._pulse_s)
         self._session.wait_dark((self._next_number - self.begun + 1) * self.packet_s + _DARK_S)
@@ -206,11 +192,15 @@ class Stream:
     def _request_position(self) -> None:
         """Request the queue's position if there was no reply for long."""
         if not self._in_flight and self._session.transport.time_s() - self._last_reply_s >= self._pulse_s:
-            self._submit(None, PushRequest(self._bank, *self._position, 0, b""))
+            self._submit(PushRequest(self._bank, *self._position, 0, b""))
 
-    def _submit(self, piece: _Piece | None, request: PushRequest) -> None:
-        self._in_flight[self._session.client.submit(request)] = (piece, request)
+    def _submit(self, request: PushRequest) -> None:
+        self._in_flight[self._session.client.submit(request)] = request
         self._submitted += 1
+
+    def _position_after(self, piece: PushRequest) -> tuple[int, int]:
+        end = piece.offset + len(piece.data)
+        return (piece.number + 1, 0) if end == self._template.packet_bytes else (piece.number, end)
 
     def _earliest_send_s(self, number: int, ahead: int) -> float:
         """Earliest time to send a packet so that at most `ahead` are on the board, s."""
@@ -235,8 +225,7 @@ class Stream:
             due_s = self._earliest_send_s(self._pieces[0].number, self._ahead)
             if due_s > now_s:
                 break
-            piece = self._pieces.pop(0)
-            self._submit(piece, PushRequest(self._bank, piece.number, piece.offset, 0, piece.data))
+            self._submit(self._pieces.pop(0))
             due_s = now_s + wait_s
         data, deadline = client.poll(now_s)
         if data:
@@ -249,7 +238,7 @@ class Stream:
             self._handle_outcome(outcome)
 
     def _handle_outcome(self, outcome: RequestOutcome) -> None:
-        piece, request = self._in_flight.pop(outcome.token)
+        request = self._in_flight.pop(outcome.token)
         reply = self._session.expect_reply(request, outcome)
         now_s = self._session.transport.time_s()
         self._position = max(self._position, (reply.number, reply.offset))
@@ -263,7 +252,7 @@ class Stream:
             self._begun_s = max(self._begun_s, now_s - self.packet_s)
         self.underruns = reply.underruns
         self._last_reply_s = now_s
-        if piece is not None and piece.after > self._position:
+        if request.data and self._position_after(request) > self._position:
             # an earlier piece was lost, or there was no room
-            insort(self._pieces, piece)
+            insort(self._pieces, request, key=lambda piece: (piece.number, piece.offset))
             self._blocked_until_s = now_s + self.packet_s / 4.0
