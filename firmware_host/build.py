@@ -13,9 +13,6 @@ from firmware_host.errors import ToolchainError
 FIRMWARE = Path(__file__).parent / "firmware"
 """The firmware's source tree."""
 
-TARGETS = {"stm32f405-8mhz": "stm32f405", "stm32f405-12mhz": "stm32f405-12mhz"}
-"""Names of the images, by part and crystal."""
-
 
 @cache
 def build_folder() -> Path:
@@ -80,7 +77,7 @@ def native_library() -> Path:
 
 
 def arm_image(board: str) -> Path:
-    """Build the ARM image of a board, `stm32f405` or `stm32f405-12mhz`; return its path.
+    """Build the ARM image of `stm32f405-8mhz` (also `stm32f405`) or `stm32f405-12mhz`; return its path.
 
     With `-1` or `-2` it is for one of the two places of updates.
 
@@ -88,4 +85,4 @@ def arm_image(board: str) -> Path:
         ToolchainError: The cross compiler is missing, or fails.
     """
     _require_tool("arm-none-eabi-gcc", "gcc-arm-none-eabi")
-    return run_make("images" if board[-2:] in ("-1", "-2") else "stm32") / f"{board}.elf"
+    return run_make("images" if board[-2:] in ("-1", "-2") else "stm32") / f"{board.replace('-8mhz', '')}.elf"

@@ -26,7 +26,7 @@ from firmware_host.protocol.wire import WireMessage, WireRequest
 Reply = TypeVar("Reply", bound=WireMessage)
 Request = TypeVar("Request", bound=WireRequest[Any])
 
-_ADVICE = {
+_ADVICE: dict[int, str] = {
     Status.UNKNOWN_TYPE: "the firmware does not know it; update the firmware",
     Status.BAD_LENGTH: "it expects {detail} bytes; host and firmware are of different versions",
     Status.OUT_OF_RANGE: "the nearest value the board can take is {detail}; choose that",
@@ -57,20 +57,19 @@ _KINDS: dict[int, type[BoardError]] = {
 }
 
 
-def make_refusal(name: str, type_: int, status: Status | int, detail: int) -> BoardError:
+def make_refusal(name: str, type_: int, status: int, detail: int) -> BoardError:
     """The error for a request that a board refused, with the reason and advice."""
     request = protocol.Type(type_).name
-    word = status.name if isinstance(status, Status) else f"status {status}"
-    advice = _ADVICE.get(status, "update the host") if isinstance(status, Status) else "update the host"
+    word = next((known.name for known in Status if known == status), f"status {status}")
     major, minor = detail & 0xFF, detail >> 8 & 0xFF
     values = {
         "detail": detail,
         "protocol": f"{major}.{minor}",
         "older": "firmware" if major < MAJOR else "host",
     }
-    message = f"{name}: {request} refused ({word}): {advice.format(**values)}"
+    message = f"{name}: {request} refused ({word}): {_ADVICE.get(status, 'update the host').format(**values)}"
     kind = _KINDS.get(status)
-    return kind(message) if kind else RefusedError(message, int(status), detail)
+    return kind(message) if kind else RefusedError(message, status, detail)
 
 
 class Session:

@@ -38,13 +38,12 @@ class UpdatePackage:
 
     @classmethod
     def build(cls, target: str) -> Self:
-        """Build the firmware for a target of `build.TARGETS`.
+        """Build the firmware for a target, such as `stm32f405-8mhz`.
 
         Raises:
             ToolchainError: The cross compiler is missing, or fails.
         """
-        name = build.TARGETS[target]
-        return cls(target, {n: FlashImage.read(build.arm_image(f"{name}-{n}")).data for n in (1, 2)})
+        return cls(target, {n: FlashImage.read(build.arm_image(f"{target}-{n}")).data for n in (1, 2)})
 
     @classmethod
     def read(cls, path: Path) -> Self:

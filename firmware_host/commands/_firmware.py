@@ -31,10 +31,10 @@ def build_images(
     For example: [bold]evlcp board build --target stm32f405-8mhz -o build[/]
     """
     from firmware_host.board.update import UpdatePackage
-    from firmware_host.build import TARGETS, arm_image
+    from firmware_host.build import arm_image
     from firmware_host.images import FlashImage
 
-    elf = arm_image(TARGETS[target])
+    elf = arm_image(target)
     image = FlashImage.read(elf)
     contents = {suffix: elf.with_suffix(suffix).read_bytes() for suffix in (".elf", ".hex", ".bin")}
     contents[".update.json"] = UpdatePackage.build(target).to_json().encode()
@@ -72,7 +72,7 @@ def flash(
 
     For example: [bold]evlcp board flash --target stm32f405-8mhz --port /dev/ttyUSB0[/]
     """
-    from firmware_host.build import TARGETS, arm_image
+    from firmware_host.build import arm_image
     from firmware_host.images import FlashImage
     from firmware_host.ports.rom import BAUD, RomLoader, flash_image
     from firmware_host.ports.transport import open_transport
@@ -82,7 +82,7 @@ def flash(
     line: BoardLine = context.obj
     if line.port is None:
         raise ConfigError("--port: expected the part's serial port; a part in its ROM is not asked for")
-    image = FlashImage.read(file) if file is not None else FlashImage.read(arm_image(TARGETS[target or ""]))
+    image = FlashImage.read(file or arm_image(target or ""))
     given = from_command_line(context, "baud") or (
         context.parent is not None and from_command_line(context.parent, "baud")
     )

@@ -65,7 +65,7 @@ class RequestOutcome:
     """
 
     token: int
-    status: Status | int | None
+    status: int | None
     reply: WireMessage | None
     detail: int
     tries: int
@@ -246,8 +246,4 @@ def _parse_outcome(pending: _PendingRequest, datagram: Datagram) -> RequestOutco
             return None
         return RequestOutcome(pending.token, Status.OK, reply, 0, pending.tries)
     detail = int.from_bytes(datagram.payload[:4], "little")
-    try:
-        status: Status | int = Status(datagram.status)
-    except ValueError:
-        status = datagram.status
-    return RequestOutcome(pending.token, status, None, detail, pending.tries)
+    return RequestOutcome(pending.token, datagram.status, None, detail, pending.tries)

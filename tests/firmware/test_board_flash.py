@@ -27,7 +27,7 @@ def random_image(count, seed=0, address=FLASH_START):
 
 def test_files_hold_one_image(evlcp, tmp_path):
     needs("arm-none-eabi-gcc", "arm-none-eabi-objcopy")
-    for target in build.TARGETS:
+    for target in ("stm32f405-8mhz", "stm32f405-12mhz"):
         done = well(evlcp("board", "build", "--target", target, "-o", tmp_path / "new", "--json"))
         table = json.loads(done.out)
         *files, package = (Path(file) for file in table["files"])
