@@ -193,7 +193,7 @@ def message(
         return
     symbols, summary = _encode_content(made, link, repeat)
     table = symbols_table(symbols, link, messages=True)
-    _write_files(symbols, link, table, out, chips)
+    write_files(symbols, link, chips, out, table)
     written = [str(path) for path in (out, chips) if path is not None]
     line = board.line(only_named=bool(written))
     text = _describe_summary(summary, written)
@@ -212,9 +212,14 @@ def message(
             keep_alive(opened)
 
 
-def _write_files(
-    symbols: NDArray[np.int64], link: Link, table: dict[str, Any], out: Path | None, chips: Path | None
+def write_files(
+    symbols: NDArray[np.int64],
+    link: Link,
+    chips: Path | None,
+    out: Path | None = None,
+    table: dict[str, Any] | None = None,
 ) -> None:
+    """Write the chips of symbols (packets, frames, clusters), and a table of them, each if it has a file."""
     from firmware_host.board.bank import symbol_chips
 
     with Outputs() as outputs:

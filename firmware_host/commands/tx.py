@@ -13,7 +13,7 @@ from evlcp_sdk.cli._common import echo, print_json
 from evlcp_sdk.errors import ConfigError
 from firmware_host.commands._json import AsJson, JsonCommand
 from firmware_host.commands._source import SymbolOptions
-from firmware_host.commands.message import keygen, message
+from firmware_host.commands.message import keygen, message, write_files
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,12 +50,7 @@ def frames(
     For example: [bold]evlcp tx frames --random 2 --seed 1 --chips chips.npy[/]
     """
     table, link = sent.load()
-    if chips is not None:
-        from evlcp_sdk.files import Outputs
-        from firmware_host.board.bank import symbol_chips
-
-        with Outputs() as outputs:
-            outputs.write_array(symbol_chips(table, link), chips)
+    write_files(table, link, chips)
     echo(_FORMATTERS[form](table, link))
 
 
