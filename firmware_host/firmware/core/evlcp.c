@@ -258,16 +258,15 @@ static enum evlcp_status on_chips(struct evlcp *e, struct exchange *x)
 
 static enum evlcp_status on_write(struct evlcp *e, struct exchange *x)
 {
-    uint8_t bank = evlcp_get8(x->in);
-    uint32_t offset = evlcp_get32(x->in + 1);
+    const struct evlcp_write_request to = evlcp_write_request_get(x->in);
     uint32_t count = x->in_length - EVLCP_WRITE_REQUEST_BYTES;
-    if (!evlcp_banks_range_ok(bank, offset, count))
+    if (!evlcp_banks_range_ok(to.bank, to.offset, count))
         return out_of_range(x, EVLCP_BANK_BYTES);
-    if (evlcp_banks_in_use(&e->banks, bank))
+    if (evlcp_banks_in_use(&e->banks, to.bank))
         return EVLCP_STATUS_BUSY;
-    e->banks.plan[bank].valid = false;
-    evlcp_copy(e->banks.content[bank] + offset, x->in + EVLCP_WRITE_REQUEST_BYTES, count);
-    const struct evlcp_write_reply reply = {.bank = bank, .offset = offset, .count = (uint16_t)count};
+    e->banks.plan[to.bank].valid = false;
+    evlcp_copy(e->banks.content[to.bank] + to.offset, x->in + EVLCP_WRITE_REQUEST_BYTES, count);
+    const struct evlcp_write_reply reply = {.bank = to.bank, .offset = to.offset, .count = (uint16_t)count};
     x->out_length = evlcp_write_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
@@ -515,9 +514,8 @@ static enum evlcp_status on_save(struct evlcp *e, struct exchange *x)
     if (autostart > 1u)
         return out_of_range(x, 1u);
     enum evlcp_status status = evlcp_settings_save(e, autostart == 1u, &reply);
-    if (status == EVLCP_STATUS_OK) {
+    if (status == EVLCP_STATUS_OK)
         x->out_length = evlcp_save_reply_put(x->out, &reply);
-    }
     return status;
 }
 
@@ -525,9 +523,8 @@ static enum evlcp_status on_recall(struct evlcp *e, struct exchange *x)
 {
     struct evlcp_recall_reply reply = {0};
     enum evlcp_status status = evlcp_settings_recall(e, false, &reply);
-    if (status == EVLCP_STATUS_OK) {
+    if (status == EVLCP_STATUS_OK)
         x->out_length = evlcp_recall_reply_put(x->out, &reply);
-    }
     return status;
 }
 
@@ -686,12 +683,6 @@ static bool is_after(uint16_t sequence, uint16_t than)
     return (int16_t)(uint16_t)(sequence - than) > 0;
 }
 
-/* Whether it repeats the latest control request, which is then answered again, but not done again. */
-static bool is_repetition(const struct evlcp_control *c, const struct evlcp_datagram *d)
-{
-    return c->known && d->sequence == c->sequence && d->type == c->type;
-}
-
 static enum evlcp_status run_control(struct evlcp *e, const struct shape *shape, struct exchange *x)
 {
     struct evlcp_control *c = &e->control;
@@ -741,7 +732,8 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
     if (d->session != e->session || e->session == EVLCP_NO_SESSION)
         return EVLCP_STATUS_NO_SESSION;
     struct evlcp_control *c = &e->control;
-    bool again = shape->control && is_repetition(c, d); /* a KEY, say, whose answer was lost */
+    /* The latest control request once more, a KEY, say, whose answer was lost: answered again, but not done again. */
+    bool again = shape->control && c->known && d->sequence == c->sequence && d->type == c->type;
     if (!trusted && !shape->query && !again)
         return EVLCP_STATUS_NEEDS_KEY;
     if (trusted) {
@@ -759,7 +751,7 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
     }
     if (shape->control)
         e->watch.acted = e->watch.acted && !trusted;
-    if (shape->control && is_repetition(c, d)) {
+    if (again) {
         evlcp_copy(x->out, c->reply, c->length);
         x->out_length = c->length;
         x->detail = evlcp_get32(c->reply);

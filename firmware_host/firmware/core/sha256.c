@@ -73,24 +73,11 @@ void evlcp_sha256_end(struct evlcp_sha256 *hash, uint8_t digest[EVLCP_SHA256_BYT
         digest[i] = (uint8_t)(hash->state[i / 4u] >> (24u - 8u * (i % 4u)));
 }
 
-void evlcp_hmac_begin(struct evlcp_hmac *mac, const uint8_t *key, uint32_t count)
+void evlcp_sha256_begin_keyed(struct evlcp_sha256 *hash, const uint8_t *key, uint32_t count, uint8_t pad)
 {
-    uint8_t inner_key[EVLCP_SHA256_BLOCK];
-    for (uint32_t i = 0; i < EVLCP_SHA256_BLOCK; i++) {
-        uint8_t byte = i < count ? key[i] : 0u;
-        inner_key[i] = byte ^ 0x36u;
-        mac->outer_key[i] = byte ^ 0x5cu;
-    }
-    evlcp_sha256_begin(&mac->inner);
-    evlcp_sha256_add(&mac->inner, inner_key, sizeof inner_key);
-}
-
-void evlcp_hmac_end(struct evlcp_hmac *mac, uint8_t digest[EVLCP_SHA256_BYTES])
-{
-    struct evlcp_sha256 outer;
-    evlcp_sha256_end(&mac->inner, digest);
-    evlcp_sha256_begin(&outer);
-    evlcp_sha256_add(&outer, mac->outer_key, sizeof mac->outer_key);
-    evlcp_sha256_add(&outer, digest, EVLCP_SHA256_BYTES);
-    evlcp_sha256_end(&outer, digest);
+    uint8_t block[EVLCP_SHA256_BLOCK];
+    for (uint32_t i = 0; i < EVLCP_SHA256_BLOCK; i++)
+        block[i] = (i < count ? key[i] : 0u) ^ pad;
+    evlcp_sha256_begin(hash);
+    evlcp_sha256_add(hash, block, sizeof block);
 }

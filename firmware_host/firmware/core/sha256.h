@@ -1,4 +1,4 @@
-/* SHA-256 (FIPS 180-4), and HMAC with it (RFC 2104). */
+/* SHA-256 (FIPS 180-4), and what HMAC (RFC 2104) needs of it. */
 #ifndef EVLCP_SHA256_H
 #define EVLCP_SHA256_H
 
@@ -17,13 +17,10 @@ void evlcp_sha256_begin(struct evlcp_sha256 *hash);
 void evlcp_sha256_add(struct evlcp_sha256 *hash, const uint8_t *bytes, uint32_t count);
 void evlcp_sha256_end(struct evlcp_sha256 *hash, uint8_t digest[EVLCP_SHA256_BYTES]);
 
-struct evlcp_hmac {
-    struct evlcp_sha256 inner;
-    uint8_t outer_key[EVLCP_SHA256_BLOCK];
-};
+#define EVLCP_HMAC_INNER 0x36u
+#define EVLCP_HMAC_OUTER 0x5cu
 
-/* With a key of at most EVLCP_SHA256_BLOCK bytes. */
-void evlcp_hmac_begin(struct evlcp_hmac *mac, const uint8_t *key, uint32_t count);
-void evlcp_hmac_end(struct evlcp_hmac *mac, uint8_t digest[EVLCP_SHA256_BYTES]);
+/* Begin the inner or outer hash of an HMAC, with a key of at most EVLCP_SHA256_BLOCK bytes. */
+void evlcp_sha256_begin_keyed(struct evlcp_sha256 *hash, const uint8_t *key, uint32_t count, uint8_t pad);
 
 #endif

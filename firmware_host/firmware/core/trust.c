@@ -42,17 +42,20 @@ static bool has_valid_seal(const struct evlcp_trust *trust, const struct evlcp_d
 {
     uint8_t head[8];
     uint8_t digest[EVLCP_SHA256_BYTES];
-    struct evlcp_hmac mac;
+    struct evlcp_sha256 hash;
     uint32_t differ = 0u;
     head[0] = d->type;
     head[1] = EVLCP_SEALED;
     evlcp_put16(head + 2, d->session);
     evlcp_put32(head + 4, number);
-    evlcp_hmac_begin(&mac, trust->key, EVLCP_KEY_BYTES);
-    evlcp_sha256_add(&mac.inner, trust->challenge, EVLCP_CHALLENGE_BYTES);
-    evlcp_sha256_add(&mac.inner, head, sizeof head);
-    evlcp_sha256_add(&mac.inner, d->payload, d->length);
-    evlcp_hmac_end(&mac, digest);
+    evlcp_sha256_begin_keyed(&hash, trust->key, EVLCP_KEY_BYTES, EVLCP_HMAC_INNER);
+    evlcp_sha256_add(&hash, trust->challenge, EVLCP_CHALLENGE_BYTES);
+    evlcp_sha256_add(&hash, head, sizeof head);
+    evlcp_sha256_add(&hash, d->payload, d->length);
+    evlcp_sha256_end(&hash, digest);
+    evlcp_sha256_begin_keyed(&hash, trust->key, EVLCP_KEY_BYTES, EVLCP_HMAC_OUTER);
+    evlcp_sha256_add(&hash, digest, sizeof digest);
+    evlcp_sha256_end(&hash, digest);
     /* In a time that does not tell how much of it is right. */
     for (uint32_t i = 0; i < EVLCP_SEAL_BYTES; i++)
         differ |= (uint32_t)(digest[i] ^ d->payload[d->length + i]);
