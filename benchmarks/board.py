@@ -8,10 +8,8 @@ counts an instruction of the core as a clock.
 
 import argparse
 import contextlib
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -30,8 +28,6 @@ from firmware_host.ports.rom import RomLoader, flash_image
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import CommitRequest
 from tests.models.usb import UsbLine
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 BAUD = 1_000_000
 CHIP_US = 100
@@ -86,9 +82,11 @@ def stm32() -> None:
     for name, fail in breaks.items():
         late_us = []
         for moment in range(12):
+            rng = np.random.default_rng(moment)
             chip, board = model()
-            provision(board, make_bank(random_packets(1, link, moment), link), Settings())
-            chip.run(5_000 + float(np.random.default_rng(moment).uniform(0, 1_000)))
+            symbols = rng.integers(0, link.codebook.data_symbols, (1, 4, 16))
+            provision(board, make_bank(symbols, link), Settings())
+            chip.run(5_000 + float(rng.uniform(0, 1_000)))
             at = chip.now
             fail(chip)
             chip.run(1_000)

@@ -134,15 +134,8 @@ def test_a_monitor_finds_its_board_again(device):
         if len(seen) == 6:
             device.reset()
     twice = [StatusReply] * 2
-    assert [type(s) for s in seen] == [
-        *twice,
-        LineError,
-        BoardReturned,
-        *twice,
-        BoardResetError,
-        BoardReturned,
-        *twice,
-    ]
+    lost, reset = [LineError, BoardReturned], [BoardResetError, BoardReturned]
+    assert [type(s) for s in seen] == [*twice, *lost, *twice, *reset, *twice]
     assert "the line broke" in str(seen[2])
     assert isinstance(seen[3], BoardReturned)
     assert seen[3].after_s >= 0.5
