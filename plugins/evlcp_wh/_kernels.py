@@ -9,6 +9,12 @@ from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
 
+_STEP_PX = 0.3
+"""Prior sigma of the change of place from value to value: 1.5 px/ms for 0.2 ms."""
+
+_PLACE_PX = 1.0
+"""Prior sigma of the bar's distance from its place."""
+
 
 @njit
 def _pair_values(first: Array, second: Array, out: Array) -> None:
@@ -157,46 +163,32 @@ def sum_values(sums: Array, probability: Array, grid: int, least: float, out: Ar
     Cells less likely than `least` are left out.
     """
     clusters, rows, columns = probability.shape
-    length = out.shape[1]
-    _, height, width = sums.shape
-    flat = sums.reshape(-1, height * width)
-    by_pixel, values = np.empty((length, height * width), np.int8), np.empty(length, np.int64)
-    top = np.zeros(rows * columns, probability.dtype)
     for k in range(clusters):
-        cells = probability[k].reshape(-1)
-        for j in range(cells.size):
-            top[j] = max(top[j], cells[j])
-    for i in range(length):
-        _pair_values(flat[2 * i], flat[2 * i + 1], by_pixel[i])
-    for r in range(rows):
-        for c in range(columns):
-            if top[r * columns + c] < least:
-                continue
-            for i in range(length):
-                values[i] = 0
-                for v in range(r * grid, (r + 1) * grid):
-                    for u in range(c * grid, (c + 1) * grid):
-                        values[i] += by_pixel[i, v * width + u]
-            for k in range(clusters):
+        for r in range(rows):
+            for c in range(columns):
                 weight = probability[k, r, c]
-                if weight >= least:
-                    for i in range(length):
-                        out[k, i] += weight * values[i]
+                if weight < least:
+                    continue
+                for i in range(out.shape[1]):
+                    value = 0
+                    for v in range(r * grid, (r + 1) * grid):
+                        for u in range(c * grid, (c + 1) * grid):
+                            first, second = sums[2 * i, v, u], sums[2 * i + 1, v, u]
+                            value += np.sign(second if second else -first)
+                    out[k, i] += weight * value
 
 
 @njit
-def match_words(
-    values: Array, by_value: Array, symbols: Array, best: Array, llr: Array
-) -> tuple[float, float]:
-    """Match each cluster's values (K, n) with the words: number of the best and its correlation, `best` (K,).
-
-    `by_value` are the words (n, words), of which the 2^bits first carry bits: `llr` (K, bits) takes the best
-    correlation of the words with each bit 0, less that with 1.
+def match_words(values: Array, by_value: Array, bits: int) -> tuple[Array, Array, Array, float, float]:
+    """Match clusters' values, float64 (K, n), with the nearest of the words, float64 (n, 2**bits or more).
 
     Returns:
-        Share of the values' sizes that agrees with the words, 0 without any; and the least size in `llr`.
+        Their numbers, int64 (K,), and their correlations, float64 (K,); by how much words with a bit 0
+        correlate better than those with 1, max-log, of the 2**bits first, float64 (K, bits); the share of the
+        values' sizes that agrees with the words, 0 without any; and the least size of a margin.
     """
     clusters, length = values.shape
+    symbols, best, margins = np.empty(clusters, np.int64), np.empty(clusters), np.empty((clusters, bits))
     size, agree, least = 0.0, 0.0, np.inf
     fit = np.empty(by_value.shape[1])
     for k in range(clusters):
@@ -210,21 +202,21 @@ def match_words(
             if fit[s] > fit[top]:
                 top = s
         symbols[k], best[k] = top, fit[top]
-        half = 1 << llr.shape[1]
-        for b in range(llr.shape[1]):
+        half = 1 << bits
+        for b in range(bits):
             # A finished bit leaves the better of its two codewords.
             half //= 2
             zero, one = -np.inf, -np.inf
             for s in range(half):
                 zero, one = max(zero, fit[s]), max(one, fit[s + half])
                 fit[s] = max(fit[s], fit[s + half])
-            llr[k, b] = zero - one
+            margins[k, b] = zero - one
             least = min(least, abs(zero - one))
         for i in range(length):
             size += abs(values[k, i])
             if values[k, i] * by_value[i, top] > 0:
                 agree += abs(values[k, i])
-    return agree / size if size > 0 else 0.0, least
+    return symbols, best, margins, agree / size if size > 0 else 0.0, least
 
 
 @njit
@@ -315,33 +307,20 @@ def sum_pair_llr(
     for pair in range(pair_llr.size):
         ratio = np.exp(min(max(pair_llr[pair], -50.0), 50.0))
         unlike[0, pair], unlike[1, pair] = (1 + ratio) / 2, (1 + 1 / ratio) / 2
-    top = np.zeros(rows * columns, probability.dtype)
     for k in range(clusters):
-        cells = probability[k].reshape(-1)
-        for j in range(cells.size):
-            top[j] = max(top[j], cells[j])
-    which, values = np.empty(clusters, np.int64), np.empty(length)
-    for r in range(rows):
-        for c in range(columns):
-            if top[r * columns + c] < least:
-                continue
-            n = 0
-            for k in range(clusters):
-                if probability[k, r, c] >= least:
-                    which[n] = k
-                    n += 1
-            for v in range(r * grid, (r + 1) * grid):
-                for u in range(c * grid, (c + 1) * grid):
-                    at = v * width + u
-                    for i in range(length):
-                        values[i] = pair_llr[pairs[known + i, at]]
-                    for j in range(n):
-                        k, against = which[j], odds
+        for r in range(rows):
+            for c in range(columns):
+                weight = probability[k, r, c]
+                if weight < least:
+                    continue
+                for v in range(r * grid, (r + 1) * grid):
+                    for u in range(c * grid, (c + 1) * grid):
+                        at, against = v * width + u, odds
                         for i in range(known):
                             against *= unlike[signs[k, i], pairs[i, at]]
-                        shows = probability[k, r, c] / (1 + against)
+                        shows = weight / (1 + against)
                         for i in range(length):
-                            out[k, i] += shows * values[i]
+                            out[k, i] += shows * pair_llr[pairs[known + i, at]]
 
 
 @njit
@@ -388,14 +367,16 @@ def match_shifts(
 
 
 @njit
-def find_path(matches: Array, known: Array, step_cost: float, place_cost: float, path: Array) -> None:
-    """Find the shifts (down, right) of all values that match best together (Viterbi), `path` (values, 2), px.
+def find_path(matches: Array, known: Array) -> Array:
+    """Find the shift (down, right) of the bar from its place in each value (Viterbi), int64 (values, 2), px.
 
     `matches` are (K, n, n, values), `known` the codes of the first values, (K, ...); of the others, each
-    cluster's is the one that fits better. A shift costs its square times `place_cost`, a change from value to
-    value its square times `step_cost`. Squares add, so the best predecessor is sought axis by axis.
+    cluster's is the one that fits better. Costs are squares, which add, so the best predecessor is sought
+    axis by axis.
     """
     clusters, side, _, values = matches.shape
+    # Twice a log-likelihood.
+    step_cost, place_cost = 1 / _STEP_PX**2, 1 / _PLACE_PX**2 / values
     first, half = known.shape[1], side // 2
     scores, steps = np.zeros((side, side, values)), np.empty((side, side))
     best, turned, top = np.empty((side, side)), np.empty((side, side)), np.empty(side)
@@ -427,6 +408,7 @@ def find_path(matches: Array, known: Array, step_cost: float, place_cost: float,
                 for b in range(side):
                     turned[b, a] = top[b] + (scores[b, a, i] if axis else 0.0)
             best, turned = turned, best
+    path = np.empty((values, 2), np.int64)
     a = b = 0
     for c in range(side):
         for d in range(side):
@@ -436,3 +418,4 @@ def find_path(matches: Array, known: Array, step_cost: float, place_cost: float,
         path[i, 0], path[i, 1] = a - half, b - half
         b = ways[i, 1, b, a]
         a = ways[i, 0, a, b]
+    return path

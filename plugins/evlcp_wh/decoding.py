@@ -26,22 +26,6 @@ _PIXEL_SHARE = 0.05
 """Prior share of the pixels in a cluster's place that show it, before their pilots: a bar is narrow."""
 
 
-def match_words(
-    values: NDArray[np.float64], by_value: NDArray[np.float64], bits: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], float, float]:
-    """Match clusters' values, float64 (K, n), with the nearest of the words, float64 (n, 2**bits or more).
-
-    Returns:
-        Their numbers, int64 (K,), and their correlations, float64 (K,); by how much words with a bit 0
-        correlate better than those with 1, max-log, of the 2**bits first, float64 (K, bits); the share of the
-        values' sizes that agrees with the words; and the least size of a margin.
-    """
-    symbols, best = np.empty(len(values), np.int64), np.empty(len(values))
-    margins = np.empty((len(values), bits))
-    agreement, least = _kernels.match_words(values, by_value, symbols, best, margins)
-    return symbols, best, margins, agreement, least
-
-
 @dataclass(frozen=True)
 class WhTransform(Decoding):
     """Presence-weighted sum of the info values, correlated with every codeword (arXiv 2510.17203).
@@ -63,7 +47,7 @@ class WhTransform(Decoding):
             values = np.zeros((len(probability), length))
             info = to_kernel_array(sums[pilot_chips:])
             _kernels.sum_values(info, probability, presence.grid_px, _MIN_WEIGHT, values)
-            symbols, best, margins, _, _ = match_words(values, by_value, codebook.bits_per_symbol)
+            symbols, best, margins, _, _ = _kernels.match_words(values, by_value, codebook.bits_per_symbol)
             energy, explained = float(np.vdot(values, values)), float(best @ best) / length
             rest = max(energy - explained, 1e-3 * energy, 1e-9)
             scale = max(float(best.sum()) / best.size / length, 0.0) * values.size / rest
@@ -129,5 +113,5 @@ class MlDecoder:
         _kernels.sum_pair_llr(
             pairs, width, self._signs, seen, grid, pair_llr, (_MIN_SOFT_WEIGHT, odds), values
         )
-        symbols, _, margins, agreement, least = match_words(values, self._by_value, self._bits)
+        symbols, _, margins, agreement, least = _kernels.match_words(values, self._by_value, self._bits)
         return SoftSymbols(symbols, margins.astype(np.float32), agreement), least, pairs, pair_llr

@@ -21,12 +21,6 @@ _UNSURE_LLR = 2.0
 _SURE_LLR = 20.0
 """Log-likelihood ratio of every bit from which on a frame is decoded once only."""
 
-_STEP_PX = 0.3
-"""Prior sigma of the change of place from value to value: 1.5 px/ms for 0.2 ms."""
-
-_PLACE_PX = 1.0
-"""Prior sigma of the bar's distance from its place."""
-
 
 @dataclass(frozen=True)
 class MotionFeedback(Decoding):
@@ -78,7 +72,7 @@ class MotionFeedback(Decoding):
             the same clusters a spacing back: what it passed on the way contradicts the symbols, and leaves a
             bit unsure. What was decoded until then does not count.
             """
-            path, reach_px = find_path(matches, pilots).tolist(), matches.shape[1] // 2
+            path, reach_px = _kernels.find_path(matches, pilots).tolist(), matches.shape[1] // 2
             farthest_px = max(abs(px) for at in path for px in at)
             if reach_px < self.far_px and farthest_px >= reach_px - 1:
                 return soft, True
@@ -109,18 +103,6 @@ def match_shifts(
     maps, grid = to_kernel_array(presence.pixels), presence.grid_px
     _kernels.match_shifts(pairs, pair_llr, INDEPENDENT_PIXELS, maps, to_kernel_array(prior), grid, out)
     return out
-
-
-def find_path(matches: NDArray[np.float32], known: NDArray[np.int8]) -> NDArray[np.int64]:
-    """Find the shift (down, right) of the bar from its place in each value, int64 (values, 2), px.
-
-    `known` are the codes of the first n values, (K, n); of the others, the better fit counts.
-    """
-    values = matches.shape[3]
-    path = np.empty((values, 2), np.int64)
-    # Twice a log-likelihood, as the costs are.
-    _kernels.find_path(matches, known, 1 / _STEP_PX**2, 1 / _PLACE_PX**2 / values, path)
-    return path
 
 
 def remove_motion(sums: NDArray[np.int16], path: list[list[int]]) -> NDArray[np.int16]:

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from evlcp_wh import _kernels
 from evlcp_wh.decoding import MlDecoder, MlSoft, WhTransform
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
-from evlcp_wh.motion_feedback import MotionFeedback, find_path, match_shifts
+from evlcp_wh.motion_feedback import MotionFeedback, match_shifts
 from evlcp_wh.pilots import WhPilots
 from evlcp_wh.separation import WhCorrelation
 from numpy.testing import assert_allclose, assert_array_equal
@@ -186,9 +187,9 @@ def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, s
     _, _, *learnt = MlDecoder(book).decode(presence, sums)
     matches = match_shifts(presence, *learnt, 4)
     known = np.concatenate([book.pilot_edges, book.codeword_edges[symbols]], axis=1)
-    assert_array_equal(find_path(matches, known), path)
+    assert_array_equal(_kernels.find_path(matches, known), path)
     # Blind to what the clusters say, it is found as well.
-    assert_array_equal(find_path(matches, book.pilot_edges.copy()), path)
+    assert_array_equal(_kernels.find_path(matches, book.pilot_edges.copy()), path)
 
 
 @pytest.mark.parametrize("right_down", [(0, -6), (6, 0), (5, -6), (0, 7)])
