@@ -85,32 +85,34 @@ class BarkerSync(Synchronization):
 
 
 @dataclass(frozen=True)
-class _Preamble:
-    """One preamble's times, us, and their variances, us2; `off_us` is NaN without negative events."""
-
-    on_us: float
-    off_us: float
-    onset_us: float
-    quality: float
-    on_noise: float
-    off_noise: float
-    onset_noise: float
-
-
-@dataclass(frozen=True)
-class _WanderingLevel:
-    """A value that wanders and jumps, and its variance."""
+class _Level:
+    """A value and its variance; NaN where it was not measured."""
 
     value: float
     variance: float
 
-    def update(self, value: float, drift_variance: float, noise_variance: float) -> "_WanderingLevel":
-        """Update by a measurement (Kalman), by the variances of the change since the last, and of it."""
-        change, spread = value - self.value, self.variance + drift_variance + noise_variance
+    def after(self, other: "_Level") -> "_Level":
+        """How much more it is than another, measured apart."""
+        return _Level(self.value - other.value, self.variance + other.variance)
+
+    def update(self, measured: "_Level", drift_variance: float) -> "_Level":
+        """Update by a measurement (Kalman), by the variance of the change since the last; it may jump."""
+        if math.isnan(measured.value):
+            return self
+        change, spread = measured.value - self.value, self.variance + drift_variance + measured.variance
         # A change too large for a drift is a jump, whose variance is its square.
         spread = max(spread, change**2) if change**2 > _JUMP_SIGMAS**2 * spread else spread
-        gain = 1 - noise_variance / spread
-        return _WanderingLevel(self.value + gain * change, gain * noise_variance)
+        gain = 1 - measured.variance / spread
+        return _Level(self.value + gain * change, gain * measured.variance)
+
+
+class _Preamble(NamedTuple):
+    """Time of a preamble's positive events, us; how much later its negative and first positive ones come."""
+
+    on: _Level
+    off_delay: _Level
+    onset: _Level
+    quality: float
 
 
 @dataclass(frozen=True)
@@ -133,8 +135,8 @@ class _Clock:
     on_us: float
     rate_us: float
     variances: tuple[float, float, float]
-    off_delay: _WanderingLevel
-    onset: _WanderingLevel
+    off_delay: _Level
+    onset: _Level
     quality: float
 
 
@@ -166,13 +168,13 @@ class BarkerSynchronizer:
     """`BarkerSync` for one codebook and packet format; pure but for what `step` is given."""
 
     def __init__(self, spec: BarkerSync, codebook: Codebook, packet: PacketFormat) -> None:
-        self._spec = spec
         self._packet = packet
         # Events come behind edges, and late ones agree with the chip that they come in.
         self._chips = 2 * codebook.preamble.astype(np.float64) - 1
         self._chips_per_part = 2 if is_pair_code(codebook.preamble) else 1
         self._due = due_chips(codebook.preamble)
         self._bin_us = packet.chip_us / _CHIP_STEPS
+        self._max_drift_us = spec.clock_tolerance_ppm * 1e-6 * packet.packet_chips * packet.chip_us
         rising = np.flatnonzero(np.diff(self._chips) > 0) + 1
         if not len(rising):
             raise ConfigError("synchronization 'barker': a preamble without a rise finds no time")
@@ -237,15 +239,17 @@ class BarkerSynchronizer:
         onset, onset_noise = _jackknife(_find_onsets(_leave_one_out(response)))
         if math.isnan(on):
             on, on_noise = off, off_noise
-        bin_us, least = self._bin_us, _TIMING_SIGMA_US**2
+        bin_us = self._bin_us
+
+        def to_us(steps: float, noise: float) -> _Level:
+            return _Level((first_bin + steps) * bin_us, _TIMING_SIGMA_US**2 + noise * bin_us**2)
+
+        positive = to_us(on, on_noise)
         return _Preamble(
-            on_us=(first_bin + on) * bin_us,
-            off_us=(first_bin + off) * bin_us,
-            onset_us=(first_bin + (lag - _CHIP_STEPS + onset)) * bin_us,
+            on=positive,
+            off_delay=to_us(off, off_noise).after(positive),
+            onset=to_us(lag - _CHIP_STEPS + onset, onset_noise).after(positive),
             quality=quality,
-            on_noise=least + on_noise * bin_us**2,
-            off_noise=least + off_noise * bin_us**2,
-            onset_noise=least + onset_noise * bin_us**2,
         )
 
     def _fit_polarities(self, counts: Floats, lag: int) -> list[tuple[float, float]]:
@@ -273,20 +277,17 @@ class BarkerSynchronizer:
         """
         if clock is None:
             return self._start_clock(self._refine_peak(peak)), None
-        if self._can_follow(clock.on_us, clock.rate_us, peak, 1):
-            found = self._refine_peak(peak)
-            packets = self._count_packets(clock, found)
-            if packets is not None:
-                return self._update_clock(clock, found, packets), None
+        followed = self._follow_clock(clock, peak)
+        if followed is not None:
+            return followed, None
         if clock.preambles == 1 and peak.quality > clock.quality + _CLEAR_DIFFERENCE:
             return self._start_clock(self._refine_peak(peak)), None
         if peak.quality < clock.quality - _CLEAR_DIFFERENCE:
             return clock, stray
         if stray is not None and self._can_follow(self._peak_us(stray), 0.0, peak, 2):
-            restarted, found = self._start_clock(self._refine_peak(stray)), self._refine_peak(peak)
-            packets = self._count_packets(restarted, found)
-            if packets is not None:
-                return self._update_clock(restarted, found, packets), None
+            followed = self._follow_clock(self._start_clock(self._refine_peak(stray)), peak)
+            if followed is not None:
+                return followed, None
         return clock, peak
 
     def _peak_us(self, peak: _Peak) -> float:
@@ -295,63 +296,53 @@ class BarkerSynchronizer:
 
     def _can_follow(self, before_us: float, rate_us: float, peak: _Peak, chips: int) -> bool:
         """Whether a peak may be whole packets after a preamble; the two are known to so many chips."""
-        packet_us = self._packet.packet_chips * self._packet.chip_us + rate_us
+        packet_us = self._packet.packet_us + rate_us
         apart_us = self._peak_us(peak) - before_us
         packets = round(apart_us / packet_us)
-        off_us = abs(apart_us - packets * packet_us) - packets * self._max_drift_us()
+        off_us = abs(apart_us - packets * packet_us) - packets * self._max_drift_us
         return packets > 0 and off_us < (chips + _ON_GRID_CHIPS) * self._packet.chip_us
 
-    def _max_drift_us(self) -> float:
-        return self._spec.clock_tolerance_ppm * 1e-6 * self._packet.packet_chips * self._packet.chip_us
-
     def _start_clock(self, found: _Preamble) -> _Clock:
-        noise = found.on_noise
-        off_delay_us = found.off_us - found.on_us
         return _Clock(
             packet=0,
             preambles=1,
-            on_us=found.on_us,
+            on_us=found.on.value,
             rate_us=0.0,
             # The bound is two sigmas.
-            variances=(noise, 0.0, (self._max_drift_us() / 2) ** 2),
-            off_delay=_WanderingLevel(0.0, self._packet.chip_us**2)
-            if math.isnan(off_delay_us)
-            else _WanderingLevel(off_delay_us, noise + found.off_noise),
-            onset=_WanderingLevel(found.onset_us - found.on_us, noise + found.onset_noise),
+            variances=(found.on.variance, 0.0, (self._max_drift_us / 2) ** 2),
+            off_delay=_Level(0.0, self._packet.chip_us**2)
+            if math.isnan(found.off_delay.value)
+            else found.off_delay,
+            onset=found.onset,
             quality=found.quality,
         )
 
     def _predict(self, clock: _Clock, packets: int) -> tuple[float, float, float, float]:
         """Time of the preamble so many packets after the lock's, and the variances there (see `_Clock`)."""
         time, both, rate = clock.variances
-        nominal_us = self._packet.packet_chips * self._packet.chip_us
+        nominal_us = self._packet.packet_us
         rate += (_WANDER_PPM * 1e-6 * nominal_us) ** 2 * packets * nominal_us * 1e-6
         time += 2 * packets * both + packets**2 * rate + packets * _LATENCY_SIGMA_US**2
         return clock.on_us + packets * (nominal_us + clock.rate_us), time, both + packets * rate, rate
 
-    def _count_packets(self, clock: _Clock, found: _Preamble) -> int | None:
-        """Whole packets from a lock's newest preamble to another; None if that is off the grid."""
-        apart = found.on_us - clock.on_us
-        packets = round(apart / (self._packet.packet_chips * self._packet.chip_us + clock.rate_us))
+    def _follow_clock(self, clock: _Clock, peak: _Peak) -> _Clock | None:
+        """The lock with a peak's preamble more; None if that is off its grid."""
+        if not self._can_follow(clock.on_us, clock.rate_us, peak, 1):
+            return None
+        found = self._refine_peak(peak)
+        packets = round((found.on.value - clock.on_us) / (self._packet.packet_us + clock.rate_us))
         if packets <= 0:
             return None
-        expected, variance, _, _ = self._predict(clock, packets)
-        off_grid = abs(found.on_us - expected) - min(2 * math.sqrt(variance), packets * self._max_drift_us())
-        return packets if off_grid < _ON_GRID_CHIPS * self._packet.chip_us else None
-
-    def _update_clock(self, clock: _Clock, found: _Preamble, packets: int) -> _Clock:
-        """The lock with a preamble more."""
-        noise = found.on_noise
         expected, time, both, rate = self._predict(clock, packets)
-        late = found.on_us - expected
+        late, noise, most_us = found.on.value - expected, found.on.variance, self._max_drift_us
+        if abs(late) - min(2 * math.sqrt(time), packets * most_us) >= _ON_GRID_CHIPS * self._packet.chip_us:
+            return None
         if late**2 > _JUMP_SIGMAS**2 * (time + noise):
             # The latency's jump adds to the time's variance alone, so that hardly any of it goes to the rate.
             time = late**2 - noise
         spread = time + noise
-        most_us = self._max_drift_us()
         rate_us = min(max(clock.rate_us + both / spread * late, -most_us), most_us)
         walk = packets * _LATENCY_SIGMA_US**2
-        off_delay_us = found.off_us - found.on_us
         preambles = min(clock.preambles + 1, _QUALITY_PACKETS)
         return _Clock(
             packet=clock.packet + packets,
@@ -359,10 +350,8 @@ class BarkerSynchronizer:
             on_us=expected + time / spread * late,
             rate_us=rate_us,
             variances=(time * noise / spread, both * noise / spread, rate - both**2 / spread),
-            off_delay=clock.off_delay
-            if math.isnan(off_delay_us)
-            else clock.off_delay.update(off_delay_us, walk, noise + found.off_noise),
-            onset=clock.onset.update(found.onset_us - found.on_us, walk, noise + found.onset_noise),
+            off_delay=clock.off_delay.update(found.off_delay, walk),
+            onset=clock.onset.update(found.onset, walk),
             quality=clock.quality + (found.quality - clock.quality) / preambles,
         )
 
