@@ -142,7 +142,7 @@ def by_approximation(code: Any, error_rate: float) -> Any:
     mean[np.setdiff1d(np.arange(n), code.sent)] = 0
     information = np.zeros(n, bool)
     information[np.argsort(mean, kind="stable")[-code.information.sum() :]] = True
-    return replace(code, information=information, nodes=list_nodes(information))
+    return replace(code, information=information)
 
 
 def orders(blocks: int) -> None:
@@ -157,7 +157,7 @@ def orders(blocks: int) -> None:
 
 def wrong_paths(code: Any, llr: NDArray[np.float32], message: NDArray[np.uint8]) -> int:
     """Wrong codewords that decoding one codeword would hold against the CRC, the search as it is."""
-    n = len(code.information)
+    n, nodes = len(code.information), list_nodes(code.information.tobytes())
     weight = np.abs(llr).astype(float)
     scale = weight.mean()
     limit = discrepancy_limit(weight / scale, code.log_share)
@@ -167,7 +167,7 @@ def wrong_paths(code: Any, llr: NDArray[np.float32], message: NDArray[np.uint8])
     for size in code.list_sizes:
         codewords, metric = np.empty((size, n), np.uint8), np.empty(size)
         most = inf if size == 1 else limit
-        found = _kernels.list_decode(mother, code.nodes, size, most, codewords, metric)
+        found = _kernels.list_decode(mother, nodes, size, most, codewords, metric)
         for path in np.argsort(metric[:found], kind="stable"):
             if metric[path] <= limit:
                 if (codewords[path][code.sent] == right).all():

@@ -1,7 +1,8 @@
 """CRC-aided polar code."""
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
+from itertools import accumulate
 from math import ceil, floor, inf, log
 from typing import Annotated
 
@@ -88,22 +89,17 @@ class Polar(ErrorCorrection):
                 f" {length}, expected at most {floor(length + log_share / log(2) + message_bits)}: the rest"
                 " is for error-correction.undetected and reserve"
             )
-        sizes = [1]
-        size = self.list_size
-        while size < self.max_list_size:
-            sizes.append(size)
-            size *= 2
-        sizes.append(self.max_list_size)
-        information = information_set(length, message_bits + CRC_BITS)
+        # Seven doublings of 1 make the largest list that may be set.
+        doubled = (min(self.list_size << times, self.max_list_size) for times in range(8))
         return _PolarCode(
             message_bits=words * message_bits,
             coded_bits=coded_bits,
             words=words,
             length=length,
-            information=information,
+            information=information_set(length, message_bits + CRC_BITS),
             sent=transmission_order(length, message_bits + CRC_BITS),
             punctured=_is_punctured(length, message_bits + CRC_BITS),
-            list_sizes=tuple(dict.fromkeys(sizes)),
+            list_sizes=tuple(dict.fromkeys((1, *doubled))),
             log_share=log_share,
         )
 
@@ -186,12 +182,14 @@ def polar_transform(bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return out
 
 
-def list_nodes(information: NDArray[np.bool_]) -> NDArray[np.int64]:
+@lru_cache(maxsize=16)
+def list_nodes(information: bytes) -> NDArray[np.int64]:
     """List the largest nodes that are decided at once, (first input, stage, kind) of each, int64 (nodes, 3).
 
-    `information` marks the inputs that carry information, bool (N,).
+    `information` are the N inputs, 1 where they carry information. It takes a millisecond, while a link is
+    compiled again and again.
     """
-    inside = np.concatenate([[0], np.cumsum(information)]).tolist()
+    inside = [0, *accumulate(information)]
     nodes, first = [], 0
     while first < len(information):
         stage, kind = 0, _kernels.REPEATED if information[first] else _kernels.FROZEN
@@ -212,12 +210,6 @@ def list_nodes(information: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.array(nodes, np.int64)
 
 
-@lru_cache(maxsize=16)
-def _nodes_of(information: bytes) -> NDArray[np.int64]:
-    """As `list_nodes`, which takes a millisecond, while a link is compiled again and again."""
-    return list_nodes(np.frombuffer(information, np.bool_))
-
-
 @dataclass(frozen=True, eq=False)
 class _PolarCode:
     """A block of codewords; `log_share` is the share of random words that may be taken for one codeword."""
@@ -231,11 +223,6 @@ class _PolarCode:
     punctured: bool
     list_sizes: tuple[int, ...]
     log_share: float
-
-    @cached_property
-    def nodes(self) -> NDArray[np.int64]:
-        """The order of decoding; found with the first block."""
-        return _nodes_of(self.information.tobytes())
 
     def encode(self, bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if bits.shape != (self.message_bits,):
@@ -272,7 +259,7 @@ class _PolarCode:
             weight /= mean
             llr = llr / mean
         limit = discrepancy_limit(weight, self.log_share)
-        n = len(self.information)
+        n, nodes = len(self.information), list_nodes(self.information.tobytes())
         # A shortened bit is known to be 0: surer than all that is received.
         mother = np.full(n, 0.0 if self.punctured else 4.0 * n, np.float32)
         mother[self.sent] = llr
@@ -281,7 +268,7 @@ class _PolarCode:
             codewords = np.empty((size, n), np.uint8)
             metric = np.empty(size)
             most = np.inf if size == 1 else limit
-            found = _kernels.list_decode(mother, self.nodes, size, most, codewords, metric)
+            found = _kernels.list_decode(mother, nodes, size, most, codewords, metric)
             for path in np.argsort(metric[:found], kind="stable"):
                 if metric[path] <= limit:
                     inputs = polar_transform(codewords[path])[self.information]

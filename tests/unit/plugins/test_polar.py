@@ -143,7 +143,7 @@ def test_list_decoding_against_its_twin(n, k, size):
         for _ in range(4):
             llr = rng.normal(mean, 1.0, n).astype(np.float32)
             wanted = twin(llr.astype(float), information, size)
-            for nodes in (list_nodes(information), single_nodes(information)):
+            for nodes in (list_nodes(information.tobytes()), single_nodes(information)):
                 codewords, metric = decode_nodes(llr, nodes, size)
                 assert_allclose(metric, [m for m, _ in wanted], rtol=1e-4, atol=1e-5)
                 assert_array_equal(codewords, [c for _, c in wanted])
