@@ -27,16 +27,8 @@ def count_bins(t_us: Array, p: Array, where: tuple[int, float, int], known: Arra
     for row in range(2):
         for b in range(bins):
             counts[row, b] = known[row, skipped + b] if b < before else 0.0
-    first_us = first_bin * bin_us
-    i, after = 0, t_us.size
-    while i < after:
-        middle = (i + after) // 2
-        if t_us[middle] < first_us:
-            i = middle + 1
-        else:
-            after = middle
-    # Time never runs backward, so each bin goes on where the last one ended.
-    start = max(int(t_us[i] / bin_us) - first_bin - 1, 0) if i < t_us.size else bins
+    # Time never runs backward: no event is before the first bin, and each goes on where the last one ended.
+    i, start = 0, max(int(t_us[0] / bin_us) - first_bin - 1, 0) if t_us.size else bins
     for b in range(start, bins):
         if i == t_us.size:
             break
