@@ -8,9 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.link.sections import RegionSpec
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.placement import (
     Placement,
@@ -20,7 +18,7 @@ from evlcp_sdk.rx.placement import (
     layout_of,
     mask_presence,
 )
-from evlcp_sdk.rx.regions import MARGIN_PX, TrackedRegion
+from evlcp_sdk.rx.regions import MARGIN_PX, BarPlace, TrackedRegion
 from evlcp_sdk.values import Events, PresenceMap, SyncLock
 
 _MIN_CLUSTER_SHARE = 0.5
@@ -119,37 +117,26 @@ class FrameAligner:
     """Aligns one frame after the other; the newest pilot is passed in with each.
 
     Args:
-        packet: Lengths of a packet's parts.
-        spec: Length of a time step, seam, and least share of the clusters.
-        centres_m: Cluster centres of the layout, m, float64 (K, 2).
-        codebook: The codes of the clusters' pilots.
+        link: Whose frames.
         separate: From a pilot's polarity sums to the presence of the clusters.
-        sensor_px: Columns and rows of the sensor: no image is larger, but for the seam.
     """
 
-    def __init__(
-        self,
-        packet: PacketFormat,
-        spec: RegionSpec,
-        centres_m: NDArray[np.float64],
-        codebook: Codebook,
-        separate: Callable[[NDArray[np.int16]], PresenceMap],
-        sensor_px: tuple[int, int],
-    ) -> None:
-        self._packet = packet
-        self._spec = spec
+    def __init__(self, link: Link, separate: Callable[[NDArray[np.int16]], PresenceMap]) -> None:
+        self._packet, self._step_us, codebook = link.packet, link.regions.step_us, link.codebook
+        # No image is larger, but for the seam.
+        self._sensor_px = link.camera.width, link.camera.height
+        centres_m = link.bar.cluster_centres_m()
         self._layout = layout_of(centres_m)
         # Clusters in an even grid are one strip, however near it is.
         across_m = np.diff(np.sort(centres_m[:, 0]))
         self._has_columns = bool((across_m > (1 + _EVEN_TOLERANCE) * self._layout.spacing_m).any())
         self._edges = codebook.pilot_edges.astype(np.int64)
         self._every = codebook.edge_spacing_chips
-        self._code_chips = slice(1, packet.pilot_chips, self._every)
+        self._code_chips = slice(1, self._packet.pilot_chips, self._every)
         self._after = codebook.trailing_chips
         self._separate = separate
-        self._sensor_px = sensor_px
         self._chip_middles: NDArray[np.float64] = (
-            np.arange(packet.frame_chips + self._after, dtype=np.float64) + 0.5
+            np.arange(self._packet.frame_chips + self._after, dtype=np.float64) + 0.5
         )
 
     def align(self, region: TrackedRegion, due: DueFrame, pilot: Pilot | None) -> AlignedFrame | None:
@@ -165,7 +152,7 @@ class FrameAligner:
             return None
         else:
             size = pilot.size_px
-        pieces = region.pieces_between(due.start_us, due.read_us, self._spec.step_us)
+        pieces = region.pieces_between(due.start_us, due.read_us, self._step_us)
         sums, offset_px = polarity_sums((e for _, e in pieces), lock, due.start_us, centre_px, size)
         if due.has_pilot:
             pilot_sums, pilot_offset_px = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
@@ -203,19 +190,18 @@ class FrameAligner:
         )
         return AlignedFrame(pilot, sums, offset_px[:, :chips], corner_px, due.middle_us)
 
-    def bar_box(
-        self, aligned: AlignedFrame, placement: Placement
-    ) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Centre (column, row) and (width, height) of a whole bar on the sensor, hidden parts too, px.
-
-        `placement` is the bar's own or that of another instance, taken to be as wide.
-        """
-        places, right_px, down_px = self._cluster_extents(aligned, placement)
-        columns, rows = places.real.tolist(), places.imag.tolist()
-        left, right = min(columns) - right_px, max(columns) + right_px
-        top, bottom = min(rows) - down_px, max(rows) + down_px
-        x, y = aligned.corner_px
-        return (x + (left + right) / 2, y + (top + bottom) / 2), (right - left, bottom - top)
+    def locate_bar(self, aligned: AlignedFrame) -> BarPlace:
+        """Where a frame with a pilot shows its bar; other instances of it are taken to be as wide."""
+        pilot, corner_px = aligned.pilot, aligned.corner_px
+        places, right_px, down_px = self._cluster_extents(aligned, pilot.placement)
+        lit_px = strips_px = None
+        if pilot.placement.scale != 0:
+            lit_px = _visible_rows(places.imag, pilot.placement.seen, down_px)
+            strips_px = _light_strips(places.real, right_px) if self._has_columns else None
+        others = (self._cluster_extents(aligned, other) for other in pilot.others)
+        boxes = tuple(_bound_bar(corner_px, *other) for other in others)
+        box = _bound_bar(corner_px, places, right_px, down_px)
+        return BarPlace(aligned.middle_us, *box, lit_px, strips_px, boxes)
 
     def drop_cut_clusters(self, aligned: AlignedFrame) -> PresenceMap:
         """Presence in a frame without the clusters that the edge of the sensor cuts.
@@ -231,40 +217,6 @@ class FrameAligner:
         width, height = self._sensor_px
         cut = (x < right_px) | (x > width - 1 - right_px) | (y < down_px) | (y > height - 1 - down_px)
         return drop_clusters(presence, cut) if cut.any() else presence
-
-    def visible_rows(self, aligned: AlignedFrame) -> tuple[float, float] | None:
-        """Upper and lower edge of the clusters that a frame shows, from the whole bar's centre, px.
-
-        None where it shows both ends.
-        """
-        placement = aligned.pilot.placement
-        if placement.scale == 0 or False not in placement.seen.tolist():
-            return None
-        places, _, down_px = self._cluster_extents(aligned, placement)
-        rows = places.imag
-        shown = rows[placement.seen].tolist()
-        top, bottom, first, last = float(rows.min()), float(rows.max()), min(shown), max(shown)
-        centre = (top + bottom) / 2
-        if first <= top and last >= bottom:
-            return None
-        return first - down_px - centre, last + down_px - centre
-
-    def light_strips(self, aligned: AlignedFrame) -> NDArray[np.float64] | None:
-        """Columns of a bar's light: (middle from the bar's centre, half of the width), px, float64 (n, 2).
-
-        None for one strip, or without a dark one between two that is wider than a bar may move in a step.
-        """
-        placement = aligned.pilot.placement
-        if not self._has_columns or placement.scale == 0:
-            return None
-        places, right_px, _ = self._cluster_extents(aligned, placement)
-        across = np.sort(places.real)
-        ends = np.flatnonzero(np.diff(across) > 2 * (right_px + MARGIN_PX))
-        if not len(ends):
-            return None
-        first, last = across[[0, *(ends + 1)]], across[[*ends, len(across) - 1]]
-        centre = (across[0] + across[-1]) / 2
-        return np.stack([(first + last) / 2 - centre, (last - first) / 2 + right_px], 1)
 
     def _cluster_extents(
         self, aligned: AlignedFrame, placement: Placement
@@ -295,6 +247,48 @@ class FrameAligner:
         # Twice an odd number: a bar of one or two columns stands in the middle of a cell of 2 px, not on the
         # edge of two, each of which would see half of it.
         return 2 * (2 * math.ceil((width_px + seam_px - 2) / 4) + 1), 2 * math.ceil((height_px + seam_px) / 2)
+
+
+def _bound_bar(
+    corner_px: tuple[float, float], places: NDArray[np.complex128], right_px: float, down_px: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Centre (column, row) and (width, height) of a whole bar on the sensor, hidden parts too, px."""
+    columns, rows = places.real.tolist(), places.imag.tolist()
+    left, right = min(columns) - right_px, max(columns) + right_px
+    top, bottom = min(rows) - down_px, max(rows) + down_px
+    x, y = corner_px
+    return (x + (left + right) / 2, y + (top + bottom) / 2), (right - left, bottom - top)
+
+
+def _visible_rows(
+    rows: NDArray[np.float64], seen: NDArray[np.bool_], down_px: float
+) -> tuple[float, float] | None:
+    """Upper and lower edge of the clusters that are seen, from the whole bar's centre, px.
+
+    None where both ends are.
+    """
+    if False not in seen.tolist():
+        return None
+    shown = rows[seen].tolist()
+    top, bottom, first, last = float(rows.min()), float(rows.max()), min(shown), max(shown)
+    centre = (top + bottom) / 2
+    if first <= top and last >= bottom:
+        return None
+    return first - down_px - centre, last + down_px - centre
+
+
+def _light_strips(columns: NDArray[np.float64], right_px: float) -> NDArray[np.float64] | None:
+    """Columns of a bar's light: (middle from the bar's centre, half of the width), px, float64 (n, 2).
+
+    None for one strip, or without a dark one between two that is wider than a bar may move in a step.
+    """
+    across = np.sort(columns)
+    ends = np.flatnonzero(np.diff(across) > 2 * (right_px + MARGIN_PX))
+    if not len(ends):
+        return None
+    first, last = across[[0, *(ends + 1)]], across[[*ends, len(across) - 1]]
+    centre = (across[0] + across[-1]) / 2
+    return np.stack([(first + last) / 2 - centre, (last - first) / 2 + right_px], 1)
 
 
 def polarity_sums(

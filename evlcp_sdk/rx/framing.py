@@ -437,12 +437,10 @@ class PacketFramer(Framer):
             return Skipped.REJECTED
         job = self._build_job(transmitter, due)
         known = transmitter.number is not None
-        found, transmitter.state = self._decoder.read(
-            aligned, due, transmitter.state, job.attitude, ranged=job.ranged, known=known
-        )
+        found, transmitter.state = self._decoder.read(aligned, job, transmitter.state, known=known)
         self.counts["frames_not_ranged"] += due.has_pilot and not job.ranged
         if not found.is_readable:
-            self._add_count(transmitter, "frames_askew", found.reading.line_of_sight.askew)
+            self._add_count(transmitter, "frames_askew", found.askew)
             return Skipped.UNREAD
         if not known:
             self._claim_ended_parts(transmitter.region, due.start_us)
@@ -451,7 +449,6 @@ class PacketFramer(Framer):
         return self._build_detection(transmitter, due, found, frame)
 
     def _publish_frame(self, transmitter: Transmitter, due: DueFrame, found: FrameResult) -> Frame:
-        reading = found.reading
         if transmitter.first_packet is None:
             transmitter.first_packet = due.packet
         assert transmitter.number is not None
@@ -460,14 +457,14 @@ class PacketFramer(Framer):
             packet=due.packet - transmitter.first_packet,
             frame=due.index,
             t_us=self._clock.camera_us(due.start_us),
-            soft=reading.soft,
-            range=reading.distance,
+            soft=found.soft,
+            range=found.distance,
             filtered=found.filtered,
-            x_px=reading.centre_px[0],
-            y_px=reading.centre_px[1],
-            points_px=reading.points_px,
-            points_sigma_px=reading.sigma_px,
-            points_flank_px=reading.flank_px,
+            x_px=found.centre_px[0],
+            y_px=found.centre_px[1],
+            points_px=found.points_px,
+            points_sigma_px=found.sigma_px,
+            points_flank_px=found.flank_px,
             points_t_us=self._clock.camera_us(due.middle_us),
             echo_of=self._reflections.echo_of(transmitter.number),
             link=self._name,
@@ -480,10 +477,10 @@ class PacketFramer(Framer):
     def _build_detection(
         self, transmitter: Transmitter, due: DueFrame, found: FrameResult, frame: Frame
     ) -> FrameDetection:
-        self._add_count(transmitter, "frames_askew", found.reading.line_of_sight.askew)
-        self._add_count(transmitter, "frames_flooded", found.reading.flooded)
+        self._add_count(transmitter, "frames_askew", found.askew)
+        self._add_count(transmitter, "frames_flooded", found.flooded)
         times = due.start_us, due.end_us, due.packet_us, due.lock.chip_us
-        return FrameDetection(frame, *times, found.cells, found.seen, found.mirrored, found.reading.spread)
+        return FrameDetection(frame, *times, found.cells, found.seen, found.mirrored, found.spread)
 
     def _is_steady(self, transmitter: Transmitter) -> bool:
         """Whether frames of a transmitter can be decoded by themselves.
@@ -597,7 +594,7 @@ class PacketFramer(Framer):
             if aligned is None or not due.has_pilot:
                 break
             transmitter.state = transmitter.state._replace(pilot=aligned.pilot)
-            shown = self._decoder.locate_bar(aligned)
+            shown = self._aligner.locate_bar(aligned)
             if follower is None:
                 region.size_px = shown.size_px
                 break

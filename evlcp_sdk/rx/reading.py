@@ -148,35 +148,6 @@ class FrameAlgorithms:
         return state, Range(float(value[0]), math.hypot(sigma, standing_m), measured.pairs)
 
 
-class FrameReading(NamedTuple):
-    """What was decoded and measured in a frame.
-
-    Attributes:
-        symbols: As decoded, int64 (K,).
-        soft: Calibrated, see `calibrate_llr`.
-        distance: As measured; its values are NaN where none was asked for.
-        points_px: Column and row of each cluster's centre on the sensor, px, float64 (K, 2), NaN where
-            unseen; empty without a pilot, as the sigmas are.
-        sigma_px: Their standard deviations, px, float64 (K,).
-        flank_px: See `Frame.points_flank_px`.
-        centre_px: Column and row of the bar's centre on the sensor, px.
-        line_of_sight: Of the bar, with its tilt as far as the attitude gives it; the default one for a panel.
-        spread: Measures how light spreads in it; None without a pilot.
-        flooded: Light changes everywhere in it, so that no symbol is given.
-    """
-
-    symbols: NDArray[np.int64]
-    soft: SoftSymbols
-    distance: Range
-    points_px: NDArray[np.float64]
-    sigma_px: NDArray[np.float64]
-    flank_px: float
-    centre_px: tuple[float, float]
-    line_of_sight: LineOfSight
-    spread: Callable[[], Spread] | None
-    flooded: bool
-
-
 class BarState(NamedTuple):
     """What the frames of a bar leave for the next one.
 
@@ -194,23 +165,40 @@ class BarState(NamedTuple):
 
 
 class FrameResult(NamedTuple):
-    """A decoded frame.
+    """What was decoded and measured in a frame.
 
     Attributes:
-        reading: What was read in it, with its distance as corrected by those before.
+        soft: Its symbols, calibrated, see `calibrate_llr`.
+        distance: As corrected by those before; its values are NaN where none was asked for.
         filtered: The filtered distance; None without tracking.
+        points_px: Column and row of each cluster's centre on the sensor, px, float64 (K, 2), NaN where
+            unseen; empty without a pilot, as the sigmas are.
+        sigma_px: Their standard deviations, px, float64 (K,).
+        flank_px: See `Frame.points_flank_px`.
+        centre_px: Column and row of the bar's centre on the sensor, px.
+        askew: See `LineOfSight`.
+        flooded: Light changes everywhere in it, so that no symbol is given.
         cells: Grid cells that show a cluster, on average.
         seen: Clusters that are seen.
         mirrored: The order of the clusters is the opposite of the layout's.
+        spread: Measures how light spreads in it; None without a pilot.
         is_readable: It has a symbol, or, of a known transmitter, a distance.
         shown: Where it showed the bar, if it was decoded by itself; None without a pilot.
     """
 
-    reading: FrameReading
+    soft: SoftSymbols
+    distance: Range
     filtered: Range | None
+    points_px: NDArray[np.float64]
+    sigma_px: NDArray[np.float64]
+    flank_px: float
+    centre_px: tuple[float, float]
+    askew: bool
+    flooded: bool
     cells: float
     seen: int
     mirrored: bool
+    spread: Callable[[], Spread] | None
     is_readable: bool
     shown: BarPlace | None = None
 
@@ -231,81 +219,6 @@ class FrameJob(NamedTuple):
     ranged: bool
 
 
-class FrameReader:
-    """Reads one aligned frame after the other; it keeps no state of a stream."""
-
-    def __init__(self, link: Link, algorithms: FrameAlgorithms, aligner: FrameAligner) -> None:
-        centres_m, book = link.bar.cluster_centres_m(), link.codebook
-        self._camera = link.camera
-        self._is_column = float(np.ptp(centres_m[:, 0])) < 1e-9
-        self._pilot_chips = link.packet.pilot_chips
-        self._least_lit = _MIN_EVENT_SHARE * book.least_edge_ratio
-        self._least_half = _DIMMED_SHARE if book.is_pair_coded else 0.0
-        self._algorithms, self._aligner = algorithms, aligner
-        self._layout = layout_of(centres_m)
-        self._pairs = neighbour_pairs(self._layout)
-        self._pilots, self._every = book.pilots.astype(np.int64), book.edge_spacing_chips
-        edges = edges_of_chips(book.pilots).astype(np.int64)
-        self._find_points = compile_finder(self._layout, edges, book.edge_spacing_chips)
-        self._behind = [chips_after_frame(book, link.packet, n) for n in range(link.packet.frames)]
-        for chips in self._behind:
-            chips.setflags(write=False)
-
-    def read(
-        self,
-        aligned: AlignedFrame,
-        due: DueFrame,
-        last_chips: NDArray[np.int8],
-        attitude: Attitude | None,
-        *,
-        ranged: bool,
-    ) -> FrameReading:
-        """Read a frame that shows its clusters; one without a pilot has no distance and no points.
-
-        `last_chips` are those that each cluster sent before its info segment, int8 (K,), -1 if not known; the
-        distance is measured if it is `ranged`.
-        """
-        sums, presence, placement = aligned.sums, aligned.pilot.presence, aligned.pilot.placement
-        soft = self._algorithms.decode(
-            presence, aligned.sums_and_trailing, last_chips, self._behind[due.index]
-        )
-        lit, images = np.empty_like(placement.seen), (sums, presence.probability, presence.grid_px)
-        # In a gap of the stream, or behind a passing pole, silence is no symbol.
-        outside, darkest, brightest = _kernels.find_lit_clusters(
-            *images, self._pilot_chips, self._least_lit, placement.seen, lit
-        )
-        calibrated = calibrate_llr(soft, lit)
-        brightens = outside > _FLOODED_SHARE and brightest > _FLOODED_RATIO
-        changes = brightens or darkest < self._least_half
-        if flooded := changes and calibrated.quality < _SURE_QUALITY:
-            calibrated = calibrate_llr(soft, np.zeros_like(lit))
-        if not due.has_pilot:
-            # Another distance or other points by the same pilot would be nothing new.
-            unseen = *_NO_POINTS, aligned.centre_px, _NO_LINE_OF_SIGHT, None
-            return FrameReading(soft.symbols, calibrated, NO_RANGE, *unseen, flooded)
-        distance = NO_RANGE
-        if ranged:
-            whole = self._aligner.drop_cut_clusters(aligned)
-            distance = self._algorithms.measure(FrameView(sums, aligned.offset_px, whole, soft))
-        pilot_sums = sums[: self._pilot_chips]
-        image = self._find_points(presence, placement, pilot_sums, aligned.corner_px)
-        # It is needed for two images at one time only; so the pilot alone is kept, not the whole frame.
-        spread = LazySpread(
-            pilot_sums.copy(), self._pilots, self._every, self._layout, self._pairs, placement
-        )
-        line = self._line_of_sight(*image[:2], attitude)
-        return FrameReading(soft.symbols, calibrated, distance, *image, line, spread, flooded)
-
-    def _line_of_sight(
-        self, points_px: NDArray[np.float64], sigma_px: NDArray[np.float64], attitude: Attitude | None
-    ) -> LineOfSight:
-        if self._is_column:
-            return line_of_sight(self._camera, points_px, sigma_px, attitude)
-        if self._camera.is_pinhole:
-            return _NO_LINE_OF_SIGHT
-        return LineOfSight(magnification=magnification_of(self._camera, points_px))
-
-
 class FrameDecoder:
     """Aligns and reads one frame after the other; it keeps no state of a stream.
 
@@ -315,19 +228,23 @@ class FrameDecoder:
     """
 
     def __init__(self, link: Link, announcer: Announcer | None = None) -> None:
+        centres_m, book = link.bar.cluster_centres_m(), link.codebook
         self.algorithms = FrameAlgorithms(link, announcer or Announcer(), compile_tracker(link))
-        self.aligner = FrameAligner(
-            link.packet,
-            link.regions,
-            link.bar.cluster_centres_m(),
-            link.codebook,
-            self.algorithms.separate,
-            (link.camera.width, link.camera.height),
-        )
-        self._reader = FrameReader(link, self.algorithms, self.aligner)
-        self._codebook = link.codebook
-        self._unknown = np.full(link.codebook.clusters, -1, np.int8)
-        self._unknown.setflags(write=False)
+        self.aligner = FrameAligner(link, self.algorithms.separate)
+        self._camera, self._codebook = link.camera, book
+        self._is_column = float(np.ptp(centres_m[:, 0])) < 1e-9
+        self._pilot_chips = link.packet.pilot_chips
+        self._least_lit = _MIN_EVENT_SHARE * book.least_edge_ratio
+        self._least_half = _DIMMED_SHARE if book.is_pair_coded else 0.0
+        self._layout = layout_of(centres_m)
+        self._pairs = neighbour_pairs(self._layout)
+        self._pilots, self._every = book.pilots.astype(np.int64), book.edge_spacing_chips
+        edges = edges_of_chips(book.pilots).astype(np.int64)
+        self._find_points = compile_finder(self._layout, edges, book.edge_spacing_chips)
+        self._behind = [chips_after_frame(book, link.packet, n) for n in range(link.packet.frames)]
+        self._unknown = np.full(book.clusters, -1, np.int8)
+        for chips in (*self._behind, self._unknown):
+            chips.setflags(write=False)
 
     def init_state(self) -> BarState:
         """State before a transmitter's first frame."""
@@ -343,48 +260,80 @@ class FrameDecoder:
         aligned = self.aligner.align(region, due, state.pilot)
         if aligned is None:
             return None
-        shown = self.locate_bar(aligned) if due.has_pilot else None
+        shown = self.aligner.locate_bar(aligned) if due.has_pilot else None
         # Within half of the seam no events are missing.
         if shown is not None and region.deviation_px(shown) > MARGIN_PX / 2:
             return None
-        found, state = self.read(aligned, due, state, job.attitude, ranged=job.ranged)
+        found, state = self.read(aligned, job, state)
         return (found._replace(shown=shown), state) if found.is_readable else None
 
-    def locate_bar(self, aligned: AlignedFrame) -> BarPlace:
-        """Where a frame with a pilot shows its bar."""
-        aligner, pilot = self.aligner, aligned.pilot
-        box = aligner.bar_box(aligned, pilot.placement)
-        others = tuple(aligner.bar_box(aligned, other) for other in pilot.others)
-        return BarPlace(
-            aligned.middle_us, *box, aligner.visible_rows(aligned), aligner.light_strips(aligned), others
-        )
-
     def read(
-        self,
-        aligned: AlignedFrame,
-        due: DueFrame,
-        state: BarState,
-        attitude: Attitude | None,
-        *,
-        ranged: bool,
-        known: bool = True,
+        self, aligned: AlignedFrame, job: FrameJob, state: BarState, *, known: bool = True
     ) -> tuple[FrameResult, BarState]:
-        """Read an aligned frame, of a known transmitter or not; return it with the state for the next."""
-        reading = self._reader.read(aligned, due, self._last_chips(state, due), attitude, ranged=ranged)
-        distance, filtered = state.distance, None
-        is_readable = max(reading.soft.symbols.tolist()) >= 0
-        # The distance alone is of use only if the transmitter is known.
-        is_readable |= known and math.isfinite(reading.distance.distance_m)
-        if is_readable:
-            distance, corrected, filtered = self.algorithms.track_distance(
-                distance, due.start_us, due.lock.chip_us, reading.distance, reading.line_of_sight
+        """Read an aligned frame, of a known transmitter or not; return it with the state for the next.
+
+        One without a pilot has no distance and no points.
+        """
+        due, pilot, sums = job.due, aligned.pilot, aligned.sums
+        presence, placement = pilot.presence, pilot.placement
+        soft = self.algorithms.decode(
+            presence, aligned.sums_and_trailing, self._last_chips(state, due), self._behind[due.index]
+        )
+        calibrated, flooded = self._calibrate(soft, sums, pilot)
+        distance, line, spread = NO_RANGE, _NO_LINE_OF_SIGHT, None
+        image = *_NO_POINTS, aligned.centre_px
+        # Another distance or other points by the same pilot would be nothing new.
+        if due.has_pilot:
+            if job.ranged:
+                whole = self.aligner.drop_cut_clusters(aligned)
+                distance = self.algorithms.measure(FrameView(sums, aligned.offset_px, whole, soft))
+            pilot_sums = sums[: self._pilot_chips]
+            image = self._find_points(presence, placement, pilot_sums, aligned.corner_px)
+            # It is needed for two images at one time only; so the pilot alone is kept, not the whole frame.
+            spread = LazySpread(
+                pilot_sums.copy(), self._pilots, self._every, self._layout, self._pairs, placement
             )
-            reading = reading._replace(distance=corrected)
-        placement = aligned.pilot.placement
+            line = self._line_of_sight(*image[:2], job.attitude)
+        is_readable = max(calibrated.symbols.tolist()) >= 0
+        # The distance alone is of use only if the transmitter is known.
+        is_readable |= known and math.isfinite(distance.distance_m)
+        tracked, filtered = state.distance, None
+        if is_readable:
+            tracked, distance, filtered = self.algorithms.track_distance(
+                tracked, due.start_us, due.lock.chip_us, distance, line
+            )
         seen = max(sum(placement.seen.tolist()), 1)
-        state = BarState(aligned.pilot, due.number, reading.symbols, distance)
-        image = placement.cells / seen, seen, placement.mirrored
-        return FrameResult(reading, filtered, *image, is_readable), state
+        light = placement.cells / seen, seen, placement.mirrored
+        found = FrameResult(
+            calibrated, distance, filtered, *image, line.askew, flooded, *light, spread, is_readable
+        )
+        return found, BarState(pilot, due.number, soft.symbols, tracked)
+
+    def _calibrate(
+        self, soft: SoftSymbols, sums: NDArray[np.int16], pilot: Pilot
+    ) -> tuple[SoftSymbols, bool]:
+        """Calibrate a frame's symbols by its polarity sums; whether light changes everywhere in it."""
+        presence, seen = pilot.presence, pilot.placement.seen
+        lit, images = np.empty_like(seen), (sums, presence.probability, presence.grid_px)
+        # In a gap of the stream, or behind a passing pole, silence is no symbol.
+        outside, darkest, brightest = _kernels.find_lit_clusters(
+            *images, self._pilot_chips, self._least_lit, seen, lit
+        )
+        calibrated = calibrate_llr(soft, lit)
+        brightens = outside > _FLOODED_SHARE and brightest > _FLOODED_RATIO
+        changes = brightens or darkest < self._least_half
+        if flooded := changes and calibrated.quality < _SURE_QUALITY:
+            calibrated = calibrate_llr(soft, np.zeros_like(lit))
+        return calibrated, flooded
+
+    def _line_of_sight(
+        self, points_px: NDArray[np.float64], sigma_px: NDArray[np.float64], attitude: Attitude | None
+    ) -> LineOfSight:
+        if self._is_column:
+            return line_of_sight(self._camera, points_px, sigma_px, attitude)
+        if self._camera.is_pinhole:
+            return _NO_LINE_OF_SIGHT
+        return LineOfSight(magnification=magnification_of(self._camera, points_px))
 
     def _last_chips(self, state: BarState, due: DueFrame) -> NDArray[np.int8]:
         """The chip that each cluster sent before a frame's info segment, int8 (K,); -1 if not known.

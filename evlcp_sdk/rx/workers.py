@@ -326,8 +326,8 @@ def _decode_frame(
 
 def _measure_spread(result: FrameResult | None) -> None:
     """Measure the spread of a frame's light now: until then the result holds the pilot."""
-    if result is not None and result.reading.spread is not None:
-        result.reading.spread()
+    if result is not None and result.spread is not None:
+        result.spread()
 
 
 def has_bar_frames(link: Link) -> bool:
