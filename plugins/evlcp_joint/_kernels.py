@@ -384,15 +384,14 @@ def build_equations(
     profile: Array,
     lens: tuple[float, float],
     fit: Array,
-    normal: Array,
-    right: Array,
-) -> float:
-    """Normal equations of a robust least-squares step, `normal` (7, 7), `right` (7,); returns the cost.
+) -> tuple[float, Array, Array]:
+    """Cost and normal equations of a robust least-squares step, (7, 7) and their right side, (7,).
 
     Of `list_steps`, with the weights of `PRIOR`. Across a boundary where codes differ, a value goes from one
     code times the gain to the next by `profile`. Residuals beyond `HUBER_LIMIT` weigh less.
     """
     gain, cost, work = fit[3], 0.0, np.empty(_COLUMNS * _BLOCK)
+    normal, right = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
     for a in range(PARAMETERS):
         right[a] = -PRIOR[a] * fit[a]
         cost += PRIOR[a] * fit[a] ** 2 / 2
@@ -451,7 +450,7 @@ def build_equations(
         normal[a, 3], normal[a, 4] = normal[3, a], normal[4, a]
         for c in _SHIFT_PARAMETERS:
             normal[min(a, c), max(a, c)] = normal[max(a, c), min(a, c)]
-    return cost
+    return cost, normal, right
 
 
 @njit
@@ -532,76 +531,65 @@ def solve_fit(
     lens: tuple[float, float],
     tolerance: float,
     fit: Array,
-    normal: Array,
-) -> bool:
-    """Levenberg-Marquardt from `fit`, which is changed; False where there is no fit.
+) -> tuple[bool, Array]:
+    """Levenberg-Marquardt from `fit`, which is changed; returns whether it fits, and the normal equations.
 
-    It ends with a step of the spacing below `tolerance` of it, or after `_MAX_STEPS`; `normal` (7, 7) takes
-    the normal equations there.
+    It ends with a step of the spacing below `tolerance` of it, or after `_MAX_STEPS`.
     """
-    right, new_normal, new_right = (
-        np.empty(PARAMETERS),
-        np.empty((PARAMETERS, PARAMETERS)),
-        np.empty(PARAMETERS),
-    )
     factor, scale = np.empty((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS)
     move, new_fit = np.empty(PARAMETERS), np.empty(PARAMETERS)
-    cost = build_equations(steps, seen, profile, lens, fit, normal, right)
+    cost, normal, right = build_equations(steps, seen, profile, lens, fit)
     damping = 1e-3
     outside = False
     for _ in range(_MAX_STEPS):
         if not factor_cholesky(normal, damping, ROUNDING_SHARE, scale, factor):
-            return False
+            return False, normal
         solve_cholesky(factor, scale, right, move)
         for a in range(PARAMETERS):
             new_fit[a] = fit[a] + move[a]
             if not np.isfinite(new_fit[a]):
-                return False
+                return False, normal
         # A spacing below a pixel, or a boundary seven times as wide as a lens makes it, is none; a long step
         # may lead there where a shorter one does not.
         outside = new_fit[0] < 1 or abs(new_fit[4]) > 2
-        new_cost = np.inf
+        new_cost, new_normal, new_right = np.inf, normal, right
         if not outside:
-            new_cost = build_equations(steps, seen, profile, lens, new_fit, new_normal, new_right)
+            new_cost, new_normal, new_right = build_equations(steps, seen, profile, lens, new_fit)
         if new_cost <= cost:
+            cost, normal, right = new_cost, new_normal, new_right
             for a in range(PARAMETERS):
-                fit[a], right[a] = new_fit[a], new_right[a]
-                for c in range(PARAMETERS):
-                    normal[a, c] = new_normal[a, c]
-            cost = new_cost
+                fit[a] = new_fit[a]
             damping /= 10
             if abs(move[0]) < tolerance * fit[0]:
-                return True
+                return True, normal
         else:
             damping *= 10
-    return not outside
+    return not outside, normal
 
 
 @njit
-def estimate_motion(shift: Array, information: Array, when: Array, out: Array) -> None:
-    """Estimate from each value's shift the motion beyond a steady drift, as far as it exceeds noise.
+def estimate_motion(shift: Array, information: Array, when: Array) -> None:
+    """Turn each value's `shift` into the motion beyond a steady drift, as far as it exceeds noise.
 
-    The shifts' variance beyond that of noise weighs each (empirical Bayes). `out` may be `shift`.
+    The shifts' variance beyond that of noise weighs each (empirical Bayes).
     """
     total, sum_shift, sum_when = 0.0, 0.0, 0.0
     for i in range(shift.size):
-        weight = max(information[i], 1e-12)
-        total += weight
-        sum_shift += weight * shift[i]
-        sum_when += weight * when[i]
+        total += information[i]
+        sum_shift += information[i] * shift[i]
+        sum_when += information[i] * when[i]
     mean_shift, mean_when = sum_shift / total, sum_when / total
     together, spread, squares = 0.0, 0.0, 0.0
     for i in range(shift.size):
-        weight, lever = max(information[i], 1e-12), when[i] - mean_when
-        together += weight * lever * (shift[i] - mean_shift)
-        spread += weight * lever * lever
+        lever = when[i] - mean_when
+        together += information[i] * lever * (shift[i] - mean_shift)
+        spread += information[i] * lever * lever
     for i in range(shift.size):
-        out[i] = shift[i] - mean_shift - (when[i] - mean_when) * together / spread
-        squares += max(information[i], 1e-12) * out[i] * out[i]
+        shift[i] = shift[i] - mean_shift - (when[i] - mean_when) * together / spread
+        squares += information[i] * shift[i] * shift[i]
     variance = (squares - (shift.size - 2)) / total
     for i in range(shift.size):
-        noise = 1 / max(information[i], 1e-12)
-        out[i] = out[i] * variance / (variance + noise) if variance > 0 else 0.0
+        shift[i] = shift[i] * variance / (variance + 1 / information[i]) if variance > 0 else 0.0
 
 
 @njit
@@ -694,14 +682,15 @@ def fit_bar(
         step = second - offset_px[2 * i]
         motion[0, i], motion[1, i] = second - (step - np.rint(step)) / 2, (i + 0.5) / n - 0.5
     by_boundary, by_value = np.empty((3, clusters + 1)), np.empty((2, n))
-    scores, normal = np.empty((values.shape[1], PARAMETERS)), np.empty((PARAMETERS, PARAMETERS))
+    scores = np.empty((values.shape[1], PARAMETERS))
     motion_so_far, own_motion, sizes = motion.copy(), np.zeros(n), np.empty(clusters + 1)
     rejected = np.zeros(clusters + 1)
     residual_squares, squares = 0.0, 0.0
     for rounds_left in range(_ROUNDS, -1, -1):
         reach = PROFILE_REACH * lens[0] * exp(fit[4])
         steps, rows = list_steps(codes, known, motion_so_far, reach, fit, values)
-        if not solve_fit(steps, rows, profile, lens, CLOSE if rounds_left else EXACT, fit, normal):
+        found, normal = solve_fit(steps, rows, profile, lens, CLOSE if rounds_left else EXACT, fit)
+        if not found:
             return _NO_FIT, by_boundary
         score_rows = scores[: 0 if rounds_left else len(scores)]
         noise, residual_squares, squares = measure_residuals(
@@ -722,8 +711,8 @@ def fit_bar(
                     rejected[b] = by_boundary[0, b]
             for i in range(n):
                 own_motion[i] += by_value[0, i]
-                by_value[1, i] /= max(noise, 1e-12)
-            estimate_motion(own_motion, by_value[1], motion[1], own_motion)
+                by_value[1, i] = max(by_value[1, i] / max(noise, 1e-12), 1e-12)
+            estimate_motion(own_motion, by_value[1], motion[1])
             for i in range(n):
                 motion_so_far[0, i] = motion[0, i] + own_motion[i]
     for b in range(clusters + 1):
