@@ -4,8 +4,6 @@ from collections.abc import Iterator
 
 from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 
-__all__ = ["evlcp_algorithms"]
-
 
 @hookimpl
 def evlcp_algorithms() -> Iterator[Algorithm]:

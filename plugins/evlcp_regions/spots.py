@@ -276,16 +276,11 @@ class _SpotDetector:
             x, y = np.abs(events.x - x_px), np.abs(events.y - y_px)
             inside = (x <= self.spec.reach_px) & (y <= self.spec.reach_px)
             slot = self._slot_numbers(events.t_us[inside], start_us)
-            signed = 2.0 * events.p[inside] - 1.0
-            slots.append(np.bincount(slot, signed) if len(slot) else np.zeros(1))
-        mine, its = (np.pad(one, (0, max(map(len, slots)) - len(one))) for one in slots)
-        products = [
-            float(mine[max(lag, 0) : len(mine) + min(lag, 0)] @ its[max(-lag, 0) : len(its) - max(lag, 0)])
-            if abs(lag) < len(mine)
-            else 0.0
-            for lag in range(-1, lags)
-        ]
-        return *products, float(mine @ mine), float(its @ its)
+            slots.append(np.bincount(slot, 2.0 * events.p[inside] - 1.0, lags))
+        most = max(map(len, slots))
+        mine, its = (np.pad(one, (0, most - len(one))) for one in slots)
+        products = np.correlate(mine, its, "full")[most - 2 : most - 1 + lags]
+        return *products.tolist(), float(mine @ mine), float(its @ its)
 
     def _make_region(self, spot: _Spot, x_px: float, y_px: float, now_us: float) -> Region:
         side = 2 * (min(max(_BOX_SIZES * spot.size_px, _BLUR_PX), self.spec.reach_px) + _BLUR_PX) + 1
