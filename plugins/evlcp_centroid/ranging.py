@@ -56,8 +56,6 @@ class CentroidRanging(Ranging):
         if not bar.has_distinct_centres:
             raise ConfigError("ranging 'centroid' needs clusters apart: use 'none' for this layout")
         layout = centres[:, 0] + 1j * centres[:, 1]
-        i, j = np.triu_indices(bar.clusters, 1)
-        layout_steps = layout[j] - layout[i]
 
         def measure(view: FrameView) -> Range:
             maps = view.presence.pixels.astype(np.float64)
@@ -71,13 +69,10 @@ class CentroidRanging(Ranging):
             right = maps.sum(1)[seen] @ np.arange(maps.shape[2]) / weight[seen]
             image, place = right + 1j * down, layout[seen]
             # The start is robust: medians of distant pairs, and of the residuals.
-            at = np.full(bar.clusters, np.nan, np.complex128)
-            at[seen] = image
-            step = np.full(len(layout_steps), np.nan, np.complex128)
-            np.divide(at[j] - at[i], layout_steps, out=step, where=layout_steps != 0)
-            both = np.isfinite(step)
-            both &= np.abs(layout_steps) >= 0.5 * np.abs(layout_steps[both]).max()
-            scale = complex(np.median(step[both].real), np.median(step[both].imag))
+            apart = place - place[:, None]
+            far = np.abs(apart) >= 0.5 * np.abs(apart).max()
+            step = (image - image[:, None])[far] / apart[far]
+            scale = complex(np.median(step.real), np.median(step.imag))
             rest = image - scale * place
             shift = complex(np.median(rest.real), np.median(rest.imag))
             for _ in range(2):
