@@ -14,12 +14,10 @@ from evlcp_sdk.rx.guard import Guard, compile_algorithm
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.regions import (
     BACKFILL_STEPS,
-    Piece,
     RegionTrack,
     RegionTracker,
     TrackedRegion,
     is_same_place,
-    memory_bytes,
 )
 from evlcp_sdk.values import Events, Region
 
@@ -37,16 +35,13 @@ class DetectorTracker(RegionTracker):
         self._detector: Detector = compile_algorithm(
             link, "detection", link.camera, link.codebook, link.packet, methods=("init", "step")
         )
-        self._limits = limits
-        self._step_us = link.regions.step_us
+        step_us = link.regions.step_us
         frames_us = _BACKFILL_FRAMES * link.packet.frame_chips * link.packet.chip_us
-        self._most_recent = max(BACKFILL_STEPS, math.ceil(frames_us / self._step_us))
+        most_recent = max(BACKFILL_STEPS, math.ceil(frames_us / step_us))
+        super().__init__(step_us, limits, most_recent, ("regions_left_out", "dropped_no_room"))
         with self._guard:
             self._state: Any = self._detector.init()
-        self._recent: deque[Piece] = deque(maxlen=self._most_recent)
         self._dropped: frozenset[int] = frozenset()
-        self.alive: list[TrackedRegion] = []
-        self.counts = {"regions_left_out": 0, "dropped_no_room": 0}
 
     def step(self, start_us: int, events: Events, occupied: Sequence[Region] = ()) -> list[TrackedRegion]:
         """See `RegionTracker`."""
@@ -81,22 +76,10 @@ class DetectorTracker(RegionTracker):
         for region in self.alive:
             region.add(start_us, _select_inside(events, region.latest))
         self._store_step(start_us, events)
-        self._limit_memory(self._limits.region_bytes, self._step_us)
+        self._limit_memory()
         seen = list(self.alive)
         self.alive = [region for region in self.alive if not region.released]
         return seen
-
-    def _store_step(self, start_us: int, events: Events) -> None:
-        """Store a step's events for regions that are found later, and steps before it within the limits."""
-        while self._recent and self._recent[0][0] <= start_us - self._most_recent * self._step_us:
-            self._recent.popleft()
-        self._recent.append((start_us, events))
-        while sum(memory_bytes(piece) for _, piece in self._recent) > self._limits.recent_bytes:
-            self._recent.popleft()
-
-    def skip_gap(self) -> None:
-        """See `RegionTracker`."""
-        self._recent.clear()
 
     def drop(self, region: TrackedRegion) -> None:
         """See `RegionTracker`."""

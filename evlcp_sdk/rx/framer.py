@@ -3,14 +3,16 @@
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any, ClassVar
 
 from evlcp_sdk.clock import CameraClock, TimeStep
 from evlcp_sdk.errors import EvlcpError, PluginError, describe_plugin_fault
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.limits import LIMITS, Limits
+from evlcp_sdk.rx.reflections import ReflectionQueue
 from evlcp_sdk.rx.regions import TrackedRegion
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.utc import ClockZero
@@ -128,11 +130,24 @@ class Framer(ABC):
     """
 
     drops_frames_at_end: ClassVar[bool]
-    counts: dict[str, int]
-    light_spans_us: dict[int, tuple[float, float]]
-    ranging_every: int
     due_us: float = math.inf
     patience_us: float
+
+    def __init__(
+        self,
+        link: Link,
+        name: str,
+        stream: StreamContext,
+        queue: ReflectionQueue,
+        on_frame: Callable[[Frame], None] | None,
+        counts: Iterable[str],
+    ) -> None:
+        self._packet, self._step_us = link.packet, link.regions.step_us
+        self._clock, self._announcer = stream.clock, stream.announcer
+        self._name, self._queue, self._on_frame = name, queue, on_frame
+        self.counts = dict.fromkeys(counts, 0)
+        self.light_spans_us: dict[int, tuple[float, float]] = {}
+        self.ranging_every = 1
 
     @abstractmethod
     def step(self, regions: list[TrackedRegion], step: TimeStep) -> None:

@@ -155,12 +155,10 @@ class PacketFramer(Framer):
         queue: ReflectionQueue,
         on_frame: Callable[[Frame], None] | None,
     ) -> None:
+        super().__init__(link, name, stream, queue, on_frame, _COUNTS)
         self._attitude_at = stream.attitude_at
-        self._packet = link.packet
-        self._step_us, self._fade_us = link.regions.step_us, link.regions.fade_us
+        self._fade_us = link.regions.fade_us
         self._tail_us = _TAIL_CHIPS * link.packet.chip_us
-        self._clock = stream.clock
-        self._announcer, self._on_frame = stream.announcer, on_frame
         self._sync_guard = Guard(link, "synchronization")
         self._synchronizer: Synchronizer = compile_algorithm(
             link, "synchronization", link.codebook, link.packet, methods=("init", "step")
@@ -171,13 +169,11 @@ class PacketFramer(Framer):
         )
         self._pending: deque[PendingFrame] = deque()
         self._regions, self._follower = regions, follower
-        self._name = name
         self._transmitters = Transmitters(
             link.packet, self._step_us, stream.limits, stream.numbers, link.codebook.trailing_chips
         )
         self._preamble = 2 * link.codebook.preamble.astype(np.float64) - 1
         self._reflections = queue.reflections
-        self._queue = queue
         self._dropped: set[int] = set()
         # Number, place and misses.
         self._ended: deque[tuple[int | None, tuple[float, float], Counter[str]]] = deque(maxlen=_MAX_ENDED)
@@ -189,9 +185,6 @@ class PacketFramer(Framer):
         caught_up = math.ceil(LOOKBACK_PACKETS * link.packet.frames / (self._max_due - per_step))
         packets_us = LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us
         self.patience_us = packets_us + (caught_up + _APPLY_AFTER_STEPS) * self._step_us
-        self.counts = dict.fromkeys(_COUNTS, 0)
-        self.light_spans_us: dict[int, tuple[float, float]] = {}
-        self.ranging_every = 1
         self._pilot_frames = 0
         self._now_us = 0
 

@@ -58,24 +58,16 @@ class PluginFramer(Framer):
         queue: ReflectionQueue,
         on_frame: Callable[[Frame], None] | None,
     ) -> None:
+        super().__init__(link, name, stream, queue, on_frame, _COUNTS)
         self._guard = Guard(link, "framing")
         self._deframer: Deframer = compile_algorithm(
             link, "framing", link.codebook, link.packet, methods=("init", "step", "close", "counts")
         )
-        self._codebook, self._packet = link.codebook, link.packet
-        self._step_us = link.regions.step_us
-        self._queue = queue
-        self._reflections = queue.reflections
-        self._camera_us: Callable[[float], float] = stream.clock.camera_us
-        self._announcer, self._on_frame = stream.announcer, on_frame
+        self._codebook = link.codebook
         self._deframed: dict[int, _DeframedRegion] = {}
-        self._name = name
         self._numbers = stream.numbers
         frames_us = _LOOKBACK_FRAMES * link.packet.info_chips * link.packet.chip_us
         self.patience_us = max(2 * link.packet.packet_chips * link.packet.chip_us, frames_us)
-        self.counts = dict.fromkeys(_COUNTS, 0)
-        self.light_spans_us: dict[int, tuple[float, float]] = {}
-        self.ranging_every = 1
 
     def step(self, regions: list[TrackedRegion], step: TimeStep) -> None:
         """Decode what the regions of a time step send."""
@@ -142,13 +134,13 @@ class PluginFramer(Framer):
                 transmitter=deframed.number,
                 packet=decoded.packet,
                 frame=decoded.frame,
-                t_us=self._camera_us(decoded.t_us),
+                t_us=self._clock.camera_us(decoded.t_us),
                 soft=decoded.soft,
                 range=NO_RANGE,
                 filtered=None,
                 x_px=float(x[0]),
                 y_px=float(y[0]),
-                echo_of=self._reflections.echo_of(deframed.number),
+                echo_of=self._queue.reflections.echo_of(deframed.number),
                 link=self._name,
             )
             self.counts["frames"] += 1

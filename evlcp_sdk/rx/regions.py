@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, Final, NamedTuple
@@ -371,8 +371,13 @@ class RegionTracker(ABC):
         counts: What was left out for want of room.
     """
 
-    alive: list[TrackedRegion]
-    counts: dict[str, int]
+    def __init__(self, step_us: int, limits: Limits, most_recent: int, counts: Iterable[str]) -> None:
+        self._step_us, self._limits, self._most_recent = step_us, limits, most_recent
+        # The newest steps, with the events of the whole image.
+        self._recent: deque[Piece] = deque()
+        self._recent_bytes = 0
+        self.alive: list[TrackedRegion] = []
+        self.counts = dict.fromkeys(counts, 0)
 
     @abstractmethod
     def step(self, start_us: int, events: Events, occupied: Sequence[Region] = ()) -> list[TrackedRegion]:
@@ -384,9 +389,10 @@ class RegionTracker(ABC):
             occupied: Places that belong to other links: no region is opened there, or reaches into them.
         """
 
-    @abstractmethod
     def skip_gap(self) -> None:
         """Forget the events before a gap in time; no region is alive."""
+        self._recent.clear()
+        self._recent_bytes = 0
 
     def close(self) -> None:
         """End the stream: forget all events."""
@@ -398,9 +404,25 @@ class RegionTracker(ABC):
         region.released = True
         self.alive = [other for other in self.alive if other is not region]
 
-    def _limit_memory(self, most_bytes: int, step_us: int) -> None:
-        """Drop the oldest events until those of all regions take `most_bytes` at the most."""
-        spare = most_bytes - sum([region.memory_bytes for region in self.alive])
+    def _store_step(self, start_us: int, events: Events) -> int:
+        """Store a step's events for regions found later, and as many steps before it as there is room for.
+
+        Returns:
+            How many steps were forgotten for want of it.
+        """
+        recent, forgotten = self._recent, 0
+        recent.append((start_us, events))
+        self._recent_bytes += memory_bytes(events)
+        while (steps := len(recent)) > self._most_recent or (
+            self._recent_bytes > self._limits.recent_bytes and steps > 1
+        ):
+            forgotten += steps <= self._most_recent
+            self._recent_bytes -= memory_bytes(recent.popleft()[1])
+        return forgotten
+
+    def _limit_memory(self) -> None:
+        """Drop the oldest events until those of all regions are within the limit."""
+        spare = self._limits.region_bytes - sum([region.memory_bytes for region in self.alive])
         while spare < 0 and (longer := [region for region in self.alive if len(region.pieces) > 1]):
             oldest_us = min(region.pieces[0][0] for region in longer)
             for region in longer:
@@ -408,7 +430,7 @@ class RegionTracker(ABC):
                     spare += region.memory_bytes
                     self.counts["dropped_no_room"] += region.drop_oldest()
                     spare -= region.memory_bytes
-                    region.forgotten_until_us = region.first_us = oldest_us + step_us
+                    region.forgotten_until_us = region.first_us = oldest_us + self._step_us
 
 
 _MIN_RISES = 20
@@ -482,8 +504,9 @@ class RhythmTracker(RegionTracker):
         gap_chips: int = 4,
         detector: BlinkDetector | None = None,
     ) -> None:
+        most_recent = max(math.ceil(min(keep_us, _MAX_RECENT_US) / spec.step_us), BACKFILL_STEPS)
+        super().__init__(spec.step_us, limits, most_recent, _COUNTS)
         self._spec = spec
-        self._limits = limits
         self._keep_us = keep_us
         self._centre_filter = centre_filter
         self._sensor_px = camera.width, camera.height
@@ -497,17 +520,12 @@ class RhythmTracker(RegionTracker):
         self._hits = np.zeros([(n - 1 >> CELL_SHIFT) + 1 for n in (camera.height, camera.width)], np.int16)
         self._new_boxes: list[Box] = []
         self._sweeps: list[Sweep] = []
-        self._recent: deque[Piece] = deque()
-        self._most_recent = max(math.ceil(min(keep_us, _MAX_RECENT_US) / spec.step_us), BACKFILL_STEPS)
-        self._recent_bytes = 0
         self._next_id = 0
-        self.alive: list[TrackedRegion] = []
-        self.counts = dict.fromkeys(_COUNTS, 0)
 
     def step(self, start_us: int, events: Events, occupied: Sequence[Region] = ()) -> list[TrackedRegion]:
         """See `RegionTracker`."""
         spec = self._spec
-        self._store_step(start_us, events)
+        self.counts["steps_forgotten"] += self._store_step(start_us, events)
         rises = self._detector.step(start_us, events, self._hits, CELL_SHIFT)
         end_us = start_us + spec.step_us
         boxes = self._predict_boxes(start_us + spec.step_us / 2, occupied)
@@ -523,7 +541,7 @@ class RhythmTracker(RegionTracker):
                 region.filter, place, region.velocity_px_us = found
                 region.track.append(place)
         self._merge_overlapping()
-        self._limit_memory(self._limits.region_bytes, spec.step_us)
+        self._limit_memory()
         self._open_regions(end_us, rises, occupied)
         resting = [one for one in self.alive if one.velocity_px_us == STILL and one.size_px is not None]
         if outside >= _MIN_SWEEP_EVENTS and not resting:
@@ -584,22 +602,10 @@ class RhythmTracker(RegionTracker):
             if any(_is_in_initial_extent(gone.latest, region) for gone in lost):
                 region.initial_extent = None
 
-    def _store_step(self, start_us: int, events: Events) -> None:
-        """Store a step's events of the whole image, and as many steps before it as there is room for."""
-        recent = self._recent
-        recent.append((start_us, events))
-        self._recent_bytes += memory_bytes(events)
-        while (steps := len(recent)) > self._most_recent or (
-            self._recent_bytes > self._limits.recent_bytes and steps > 1
-        ):
-            self.counts["steps_forgotten"] += steps <= self._most_recent
-            self._recent_bytes -= memory_bytes(recent.popleft()[1])
-
     def skip_gap(self) -> None:
         """See `RegionTracker`."""
+        super().skip_gap()
         self._new_boxes = []
-        self._recent.clear()
-        self._recent_bytes = 0
 
     def gather_events(
         self, region: TrackedRegion, from_us: float = -math.inf, until_us: float = math.inf
@@ -624,7 +630,7 @@ class RhythmTracker(RegionTracker):
             box = self._search_box(x_px, y_px, *size_px)
             gathered[start] = self._detector.select(events, [box], [False])[0]
         region.replace_pieces(deque((start, gathered.get(start, events)) for start, events in region.pieces))
-        self._limit_memory(self._limits.region_bytes, step_us)
+        self._limit_memory()
 
     def correct_region(self, region: TrackedRegion, bar: BarPlace) -> float:
         """Fit a region to its bar as a frame showed it; return how far it was off, px.
