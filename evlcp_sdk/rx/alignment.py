@@ -236,7 +236,7 @@ class FrameAligner:
                 turn = own.scale / abs(own.scale) * layout.direction
                 across_px = _kernels.farthest_offset_px(selected, grid, own.shift, turn) + grid / 2
                 direction *= layout.direction
-            places = placement.centres_px(layout)
+            places = placement.centres_px
             right_px = along_px * abs(direction.real) + across_px * abs(direction.imag)
             down_px = along_px * abs(direction.imag) + across_px * abs(direction.real)
         return places, right_px, down_px

@@ -72,6 +72,7 @@ class Placement:
         seen: Clusters that stand in their place, bool (K,).
         cells: Grid cells that show a cluster in its place.
         chance: Upper bound of the probability of so many clusters in their places by chance.
+        centres_px: Cluster centres in the image, px, complex128 (K,).
     """
 
     scale: complex
@@ -80,15 +81,7 @@ class Placement:
     seen: NDArray[np.bool_]
     cells: float
     chance: float
-
-    def centres_px(self, layout: Layout) -> NDArray[np.complex128]:
-        """Cluster centres in the image, px, complex128 (K,); not to be changed."""
-        # Kept, as a frame needs them several times.
-        known: tuple[Layout, NDArray[np.complex128]] | None = vars(self).get("_centres_px")
-        if known is None or known[0] is not layout:
-            known = layout, self.scale * orient_centres(layout, self.mirrored) + self.shift
-            vars(self)["_centres_px"] = known
-        return known[1]
+    centres_px: NDArray[np.complex128]
 
 
 _Blobs = tuple[NDArray[np.complex128], NDArray[np.int64], NDArray[np.int64]]
@@ -135,7 +128,8 @@ def find_placements(
         return []
     if clusters == 1:
         total = float(many.sum())
-        return [Placement(0j, complex(many / total @ at), False, np.ones(1, np.bool_), total, 1.0)]
+        shift = complex(many / total @ at)
+        return [Placement(0j, shift, False, np.ones(1, np.bool_), total, 1.0, np.array([shift]))]
     slack_px = presence.grid_px / 2
     found: list[Placement] = []
     while len(found) < _MAX_INSTANCES:
@@ -159,7 +153,7 @@ def find_placements(
         # Blobs outside of the placement: neither in a cluster's place nor elsewhere in the bar.
         at, cluster, many = blobs
         reach_px = _cell_reach_px(best.scale, layout, slack_px)
-        off = np.abs(at[:, None] - best.centres_px(layout)).min(1) > reach_px
+        off = np.abs(at[:, None] - best.centres_px).min(1) > reach_px
         blobs = at[off], cluster[off], many[off]
     return found
 
@@ -181,7 +175,7 @@ def mask_presence(presence: PresenceMap, layout: Layout, placement: Placement) -
     if layout.is_line:
         unit *= layout.direction
     spacing_px = abs(placement.scale) * layout.spacing_m
-    places = placement.centres_px(layout)
+    places = placement.centres_px
     given = presence.probability, presence.selected, presence.pixels
     # Most stays 0, and `zeros`, unlike `zeros_like`, does not write it.
     cells, dtype = given[0].shape, given[0].dtype
@@ -256,9 +250,7 @@ def _find_best(
     if layout.is_line:
         direction = scale * layout.direction
         mirrored = direction.real + direction.imag < 0
-    placement = Placement(scale, shift, mirrored, seen, cells, chance)
-    vars(placement)["_centres_px"] = layout, places
-    return placement, left
+    return Placement(scale, shift, mirrored, seen, cells, chance, places), left
 
 
 def _binomial_tail(hits: int, trials: int, p_hit: float) -> float:

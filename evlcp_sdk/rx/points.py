@@ -68,7 +68,7 @@ def compile_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> Find
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[float, float]]:
         # A single cluster has no direction.
         unit = placement.scale / (abs(placement.scale) or 1.0)
-        reach_px, places = abs(placement.scale) * spacing_m, placement.centres_px(layout)
+        reach_px, places = abs(placement.scale) * spacing_m, placement.centres_px
         at_m = orient_centres(layout, placement.mirrored)
         across_px = max(_ACROSS_PX, reach_px / 2) if layout.is_line else 0.0
         mean, wider = np.empty((clusters, 2)), np.empty(clusters)

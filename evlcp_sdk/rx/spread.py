@@ -116,7 +116,7 @@ class Spread:
         across = np.zeros((2, 2 * _ACROSS_PX + 1), np.int64)
         spacing_px = abs(placement.scale) * layout.spacing_m
         if spacing_px > 0:
-            places, seen = placement.centres_px(layout), placement.seen
+            places, seen = placement.centres_px, placement.seen
             _kernels.count_answers_between(
                 sums, pilots, places, seen, pairs, (_AXIS_PX, _MIXED_FROM, _MIXED_TO), between
             )

@@ -56,7 +56,7 @@ def test_a_bar_at_any_size_and_turn(px_per_m, turn, right, down):
     scale, shift = px_per_m * np.exp(1j * turn), complex(112 + right, 112 + down)
     (found,) = find_placements(draw_cells(CENTRES, (scale, shift), size=(224, 224)), LINE)
     # A cell is two pixels wide.
-    assert np.abs(found.centres_px(LINE) - scale * LINE.centres_m - shift).max() < 1.5
+    assert np.abs(found.centres_px - scale * LINE.centres_m - shift).max() < 1.5
     assert found.seen.all()
     assert found.chance < 1e-6
 
@@ -130,7 +130,7 @@ def test_a_panel_and_its_mirror_image(conj):
     assert found.mirrored == conj
     assert abs(found.shift - shift) < 1
     assert np.abs(found.scale - scale) < 6
-    places = found.centres_px(layout)
+    places = found.centres_px
     assert np.abs(places[1] - places[0]) == pytest.approx(300 * 0.08, rel=0.03)
 
 
