@@ -560,18 +560,14 @@ def find_blobs(selected: Array, grid: int) -> tuple[Array, Array, Array]:
     Means are in pixels, `grid` to a cell's side. Blobs of one size are in the order of clusters and rows.
     """
     clusters, rows, columns = selected.shape
-    room, lit = 0, np.empty((clusters, 2), np.int64)
-    for k in range(clusters):
-        lit[k, 0], lit[k, 1] = find_rows(selected[k])
-        for r in range(lit[k, 0], lit[k, 1]):
-            for c in range(columns):
-                room += selected[k, r, c]
+    # Of 2 x 2 cells, one at the most begins a blob.
+    room = clusters * ((rows + 1) // 2) * ((columns + 1) // 2)
     some, of = np.empty(room, np.complex128), np.empty((2, room), np.int64)
     done = np.empty((rows, columns), np.bool_)
     found = np.empty((rows * columns, 2), np.int64)
     n, most = 0, 0
     for k in range(clusters):
-        first, last = lit[k]
+        first, last = find_rows(selected[k])
         done[first:last] = False
         for r in range(first, last):
             for c in range(columns):
@@ -1722,7 +1718,7 @@ def interpolate_centres(
     `samples` (5, n) are times, columns, rows, ... Beyond the first and the last one the line goes on for
     `ahead` times the time to their neighbour.
     """
-    n = samples.shape[1]
+    t_us, n = samples[0], samples.shape[1]
     for a in range(2):
         at = samples[a + 1]
         j = 0
@@ -1731,24 +1727,13 @@ def interpolate_centres(
                 centre[a, i] = at[0]
                 continue
             t = start_us + times[i] * unit_us
-            while j > 0 and samples[0, j] > t:
+            while j > 0 and t_us[j] > t:
                 j -= 1
-            while j < n - 2 and samples[0, j + 1] <= t:
+            while j < n - 2 and t_us[j + 1] <= t:
                 j += 1
-            # The piece of the way that holds the time: from a sample to the next, or beyond the outermost.
-            from_us, until_us, here, there = samples[0, j], samples[0, j + 1], at[j], at[j + 1]
-            if t < from_us:
-                until_us, there = from_us, here
-                from_us -= ahead * (samples[0, 1] - from_us)
-                here -= ahead * (at[1] - here)
-            elif t >= until_us:
-                from_us, here = until_us, there
-                until_us += ahead * (until_us - samples[0, n - 2])
-                there += ahead * (there - at[n - 2])
-            t = min(max(t, from_us), until_us)
-            centre[a, i] = (
-                there if t == until_us else (there - here) / (until_us - from_us) * (t - from_us) + here
-            )
+            span_us, known = t_us[j + 1] - t_us[j], j + int(t > t_us[j + 1])
+            after_us = min(max(t - t_us[known], -ahead * span_us), ahead * span_us)
+            centre[a, i] = (at[j + 1] - at[j]) / span_us * after_us + at[known]
 
 
 @njit

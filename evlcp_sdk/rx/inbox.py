@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -113,7 +114,7 @@ class MessageAssembler:
         clock_zero: ClockZero = None,
     ) -> None:
         self._coder = coder
-        self._guard = guard
+        self._guard = guard or nullcontext()
         self._kinds = kinds
         self._spec = spec
         self._room = coder.block_bytes - HEADER_BYTES
@@ -202,12 +203,8 @@ class MessageAssembler:
         return content, total.packets
 
     def _decode_block(self, llr: NDArray[np.float32]) -> bytes | None:
-        try:
+        with self._guard:
             return self._coder.decode_block(llr)
-        except (Exception, SystemExit) as fault:
-            if self._guard is not None:
-                self._guard.reraise(fault)
-            raise
 
     def _add_block(self, inbox: _Inbox, block: Block, packet: Packet) -> list[ReceivedMessage]:
         """Add a block to its message; return what can be delivered now."""
