@@ -22,7 +22,6 @@ come soon after the one before open a region. One pass, four bytes a pixel.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 
@@ -73,37 +72,24 @@ _LAST_SHORT = 6
 code are whole chips apart."""
 
 
-@dataclass(frozen=True, eq=False)
-class BlinkTables:
-    """How times between rises count, by their ticks.
+@lru_cache(maxsize=4)
+def _build_tables(chip_us: float, gap_chips: int) -> tuple[int, int, NDArray[np.uint8], NDArray[np.uint16]]:
+    """How times between rises count, by the length of a chip, us, and the longest such time in the codes.
 
-    Attributes:
-        tick_shift: A tick is 2^this us.
-        least_ticks: Ticks below which a rise is the same as the one before.
-        kinds: Kind of a time by its ticks, the last for all beyond, uint8 (ticks,).
-        transitions: See `_build_transitions`.
+    Returns:
+        Shift (a tick is 2^this us); ticks below which a rise is the same as the one before; kind of a time by
+        its ticks, the last for all beyond, uint8 (ticks,); transitions, see `_build_transitions`.
     """
-
-    tick_shift: int
-    least_ticks: int
-    kinds: NDArray[np.uint8]
-    transitions: NDArray[np.uint16]
-
-    @classmethod
-    @lru_cache(maxsize=4)
-    def of(cls, chip_us: float, gap_chips: int) -> "BlinkTables":
-        """Tables for a length of chips, us, and the longest time from rise to rise in the codes, chips."""
-        late_us = (min(3 * gap_chips, _MAX_CHIPS) + 0.5) * chip_us
-        shift = max(math.ceil(math.log2(late_us / _LONGEST_TICKS)), 0)
-        tick_us = 1 << shift
-        run_us = np.arange(int(late_us) // tick_us + 2) * float(tick_us)
-        chips = np.floor(run_us / chip_us + 0.5)
-        middles = np.array(_TIMES)
-        kinds = 1 + np.searchsorted((middles[1:] + middles[:-1]) / 2 * chip_us, run_us, side="right")
-        kinds += _OFF_CHIPS * (np.abs(run_us - chips * chip_us) > _JITTER_CHIPS * chip_us)
-        kinds[run_us > late_us] = _LATE
-        least_ticks = int(_MIN_CHIPS * chip_us) >> shift
-        return cls(shift, least_ticks, kinds.astype(np.uint8), _build_transitions(gap_chips))
+    late_us = (min(3 * gap_chips, _MAX_CHIPS) + 0.5) * chip_us
+    shift = max(math.ceil(math.log2(late_us / _LONGEST_TICKS)), 0)
+    tick_us = 1 << shift
+    run_us = np.arange(int(late_us) // tick_us + 2) * float(tick_us)
+    chips = np.floor(run_us / chip_us + 0.5)
+    middles = np.array(_TIMES)
+    kinds = 1 + np.searchsorted((middles[1:] + middles[:-1]) / 2 * chip_us, run_us, side="right")
+    kinds += _OFF_CHIPS * (np.abs(run_us - chips * chip_us) > _JITTER_CHIPS * chip_us)
+    kinds[run_us > late_us] = _LATE
+    return shift, int(_MIN_CHIPS * chip_us) >> shift, kinds.astype(np.uint8), _build_transitions(gap_chips)
 
 
 def _build_transitions(gap_chips: int) -> NDArray[np.uint16]:
@@ -173,8 +159,8 @@ class BlinkDetector:
         *,
         is_shared: bool = False,
     ) -> None:
-        self._tables = BlinkTables.of(chip_us, gap_chips)
-        self._shift = self._tables.tick_shift
+        tables = _build_tables(chip_us, gap_chips)
+        self._shift, self._least_ticks, self._kinds, self._transitions = tables
         self._min_score = min_score
         self._pixels = np.zeros((height, width), np.uint32)
         # Longer than any time that counts; after so long a gap all rows are visited at once.
@@ -211,11 +197,11 @@ class BlinkDetector:
             rows = height if is_gap else -(-height * ticks // self._visit_ticks)
             aging = self._next_row, rows, now, 0 if is_gap else self._old, self._old
             self._next_row, self._now = (self._next_row + rows) % height, now
-        first, tables = self._done, self._tables
+        first = self._done
         newest = events.t_us[first:], events.x[first:], events.y[first:], events.p[first:]
-        limits, shifts = (tables.least_ticks, self._min_score, OPENING_REPEATS), (self._shift, cell_shift)
+        limits, shifts = (self._least_ticks, self._min_score, OPENING_REPEATS), (self._shift, cell_shift)
         self._hits += _kernels.score_rises(
-            newest, self._pixels, hits, tables.kinds, tables.transitions, limits, shifts, aging
+            newest, self._pixels, hits, self._kinds, self._transitions, limits, shifts, aging
         )
         self._done = events.t_us.size
         if self._is_shared:
