@@ -15,7 +15,7 @@ from evlcp_sdk.plugin.roles import Synchronizer
 from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame
 from evlcp_sdk.rx.framer import Framer, StreamContext, record_light
 from evlcp_sdk.rx.guard import Guard, compile_algorithm
-from evlcp_sdk.rx.reading import BarDecoder, FrameDecoder, FrameJob, FrameResult, LocalBarDecoder
+from evlcp_sdk.rx.reading import BarDecoder, FrameDecoder, FrameJob, FrameResult
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
 from evlcp_sdk.rx.regions import (
     MARGIN_PX,
@@ -165,7 +165,7 @@ class PacketFramer(Framer):
         )
         self._decoder, self._aligner = decoder, decoder.aligner
         self._bar_decoders: Sequence[BarDecoder] = (
-            [LocalBarDecoder(decoder)] if stream.bar_decoders is None else stream.bar_decoders(name)
+            [BarDecoder(decoder)] if stream.bar_decoders is None else stream.bar_decoders(name)
         )
         self._pending: deque[PendingFrame] = deque()
         self._regions, self._follower = regions, follower

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -351,36 +351,14 @@ class FrameDecoder:
         return np.where(symbols >= 0, book.codewords[symbols, -1].astype(np.int8), np.int8(-1))
 
 
-class BarDecoder(Protocol):
+class BarDecoder:
     """Decodes the frames of bars, each by what its bar's earlier frames left; bars go by numbers.
 
     After a frame that it cannot decode, none of the bar's is decoded until its state is put here again.
 
     Attributes:
-        is_immediate: Results are known when frames are submitted.
+        is_immediate: Results are known when frames are submitted, as in this process.
     """
-
-    is_immediate: bool
-
-    def __len__(self) -> int:
-        """How many bars it decodes."""
-        ...
-
-    def put_state(self, bar: int, state: BarState) -> None:
-        """Decode a bar's frames here from now on."""
-        ...
-
-    def take_state(self, bar: int) -> BarState:
-        """Give a bar's state back: its frames are decoded elsewhere."""
-        ...
-
-    def decode(self, bar: int, job: FrameJob) -> Callable[[], FrameResult | None]:
-        """Decode a bar's next frame, see `FrameDecoder.decode`; return what fetches the result."""
-        ...
-
-
-class LocalBarDecoder:
-    """A `BarDecoder` in this process."""
 
     is_immediate = True
 
@@ -390,19 +368,20 @@ class LocalBarDecoder:
         self._stopped: set[int] = set()
 
     def __len__(self) -> int:
+        """How many bars it decodes."""
         return len(self._states)
 
     def put_state(self, bar: int, state: BarState) -> None:
-        """See `BarDecoder`."""
+        """Decode a bar's frames here from now on."""
         self._states[bar] = state
         self._stopped.discard(bar)
 
     def take_state(self, bar: int) -> BarState:
-        """See `BarDecoder`."""
+        """Give a bar's state back: its frames are decoded elsewhere."""
         return self._states.pop(bar)
 
     def decode(self, bar: int, job: FrameJob) -> Callable[[], FrameResult | None]:
-        """See `BarDecoder`."""
+        """Decode a bar's next frame, see `FrameDecoder.decode`; return what fetches the result."""
         found = None if bar in self._stopped else self._decoder.decode(job, self._states[bar])
         if found is None:
             self._stopped.add(bar)

@@ -27,7 +27,7 @@ from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import DueFrame
 from evlcp_sdk.rx.placement import layout_of
-from evlcp_sdk.rx.reading import BarState, FrameDecoder, FrameJob, FrameResult, LocalBarDecoder
+from evlcp_sdk.rx.reading import BarDecoder, BarState, FrameDecoder, FrameJob, FrameResult
 from evlcp_sdk.rx.regions import EVENT_BYTES, Piece, RegionTrack, TrackedRegion
 from evlcp_sdk.values import Events, Region, SyncLock
 
@@ -218,8 +218,8 @@ class _Worker:
         return WorkerError(f"{self._name} ended {how}; what it was decoding is lost: receive again")
 
 
-class _WorkerBarDecoder:
-    """`BarDecoder` of a link's bars in a worker."""
+class _WorkerBarDecoder(BarDecoder):
+    """Hands the frames of a link's bars to the decoder of a worker."""
 
     is_immediate = False
 
@@ -284,7 +284,7 @@ def _run_worker(pipe: Connection, memory: Any, links: Mapping[str, Link]) -> Non
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     shared, poller = np.frombuffer(memory, np.uint8), _make_poller(pipe)
     try:
-        decoders = {name: LocalBarDecoder(FrameDecoder(link)) for name, link in links.items()}
+        decoders = {name: BarDecoder(FrameDecoder(link)) for name, link in links.items()}
         for link in links.values():
             load_decoder_kernels(link)
         pipe.send(None)
@@ -303,7 +303,7 @@ def _run_worker(pipe: Connection, memory: Any, links: Mapping[str, Link]) -> Non
 
 
 def _decode_frame(
-    decoder: LocalBarDecoder,
+    decoder: BarDecoder,
     bar: int,
     job: FrameJob,
     places: list[tuple[int, int, int]],
@@ -360,7 +360,7 @@ def load_decoder_kernels(link: Link) -> None:
     order = np.argsort(t_us, axis=None)
     events = Events.of(*(column.ravel()[order].astype(np.int64) for column in columns))
     frame_decoder = FrameDecoder(link)
-    decoder = LocalBarDecoder(frame_decoder)
+    decoder = BarDecoder(frame_decoder)
     for some in (events, events[rng.random(len(events)) < _FEW_SHARE]):
         region = TrackedRegion(
             0, RegionTrack([Region(0, t, middle.real, middle.imag, *size_px) for t in (0.0, due.end_us)]), 0
