@@ -379,11 +379,7 @@ def _model_levels(
 
 @njit
 def build_equations(
-    steps: Array,
-    seen: Array,
-    profile: Array,
-    lens: tuple[float, float],
-    fit: Array,
+    steps: Array, seen: Array, profile: Array, lens: tuple[float, float], fit: Array
 ) -> tuple[float, Array, Array]:
     """Cost and normal equations of a robust least-squares step, (7, 7) and their right side, (7,).
 
@@ -525,12 +521,7 @@ def measure_residuals(
 
 @njit
 def solve_fit(
-    steps: Array,
-    seen: Array,
-    profile: Array,
-    lens: tuple[float, float],
-    tolerance: float,
-    fit: Array,
+    steps: Array, seen: Array, profile: Array, lens: tuple[float, float], tolerance: float, fit: Array
 ) -> tuple[bool, Array]:
     """Levenberg-Marquardt from `fit`, which is changed; returns whether it fits, and the normal equations.
 
@@ -681,10 +672,9 @@ def fit_bar(
         second = offset_px[2 * i + 1]
         step = second - offset_px[2 * i]
         motion[0, i], motion[1, i] = second - (step - np.rint(step)) / 2, (i + 0.5) / n - 0.5
-    by_boundary, by_value = np.empty((3, clusters + 1)), np.empty((2, n))
-    scores = np.empty((values.shape[1], PARAMETERS))
+    by_boundary, rejected = np.empty((3, clusters + 1)), np.zeros(clusters + 1)
+    by_value, scores = np.empty((2, n)), np.empty((values.shape[1], PARAMETERS))
     motion_so_far, own_motion, sizes = motion.copy(), np.zeros(n), np.empty(clusters + 1)
-    rejected = np.zeros(clusters + 1)
     residual_squares, squares = 0.0, 0.0
     for rounds_left in range(_ROUNDS, -1, -1):
         reach = PROFILE_REACH * lens[0] * exp(fit[4])
