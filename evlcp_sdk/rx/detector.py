@@ -38,7 +38,7 @@ class DetectorTracker(RegionTracker):
         step_us = link.regions.step_us
         frames_us = _BACKFILL_FRAMES * link.packet.frame_chips * link.packet.chip_us
         most_recent = max(BACKFILL_STEPS, math.ceil(frames_us / step_us))
-        super().__init__(step_us, limits, most_recent, ("regions_left_out", "dropped_no_room"))
+        super().__init__(step_us, limits, most_recent)
         with self._guard:
             self._state: Any = self._detector.init()
         self._dropped: frozenset[int] = frozenset()

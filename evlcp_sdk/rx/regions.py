@@ -3,7 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any, Final, NamedTuple
@@ -363,6 +363,9 @@ def is_same_place(one: Region, other: Region) -> bool:
     return any(right <= at.width_px / 2 and down <= at.height_px / 2 for at in (one, other))
 
 
+_COUNTS = ("steps_forgotten", "dropped_no_room", "regions_left_out", "regions_gave_way", "areas_left_out")
+
+
 class RegionTracker(ABC):
     """Tracks the regions of a stream, with their events, from time step to time step.
 
@@ -371,13 +374,13 @@ class RegionTracker(ABC):
         counts: What was left out for want of room.
     """
 
-    def __init__(self, step_us: int, limits: Limits, most_recent: int, counts: Iterable[str]) -> None:
+    def __init__(self, step_us: int, limits: Limits, most_recent: int) -> None:
         self._step_us, self._limits, self._most_recent = step_us, limits, most_recent
         # The newest steps, with the events of the whole image.
         self._recent: deque[Piece] = deque()
         self._recent_bytes = 0
         self.alive: list[TrackedRegion] = []
-        self.counts = dict.fromkeys(counts, 0)
+        self.counts = dict.fromkeys(_COUNTS, 0)
 
     @abstractmethod
     def step(self, start_us: int, events: Events, occupied: Sequence[Region] = ()) -> list[TrackedRegion]:
@@ -404,21 +407,16 @@ class RegionTracker(ABC):
         region.released = True
         self.alive = [other for other in self.alive if other is not region]
 
-    def _store_step(self, start_us: int, events: Events) -> int:
-        """Store a step's events for regions found later, and as many steps before it as there is room for.
-
-        Returns:
-            How many steps were forgotten for want of it.
-        """
-        recent, forgotten = self._recent, 0
+    def _store_step(self, start_us: int, events: Events) -> None:
+        """Store a step's events for regions found later, and as many steps before it as there is room for."""
+        recent = self._recent
         recent.append((start_us, events))
         self._recent_bytes += memory_bytes(events)
         while (steps := len(recent)) > self._most_recent or (
             self._recent_bytes > self._limits.recent_bytes and steps > 1
         ):
-            forgotten += steps <= self._most_recent
+            self.counts["steps_forgotten"] += steps <= self._most_recent
             self._recent_bytes -= memory_bytes(recent.popleft()[1])
-        return forgotten
 
     def _limit_memory(self) -> None:
         """Drop the oldest events until those of all regions are within the limit."""
@@ -466,8 +464,6 @@ when it is found: two showed it, and it moved alike before."""
 _CENTRE_SIGMA_PX = 0.25
 """Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
 
-_COUNTS = ("steps_forgotten", "dropped_no_room", "regions_left_out", "regions_gave_way", "areas_left_out")
-
 _CORRECTION_PX = 1.0
 """Deviation from its bar, in place or size, from which on a region is corrected: a fifth of its seam."""
 
@@ -505,7 +501,7 @@ class RhythmTracker(RegionTracker):
         detector: BlinkDetector | None = None,
     ) -> None:
         most_recent = max(math.ceil(min(keep_us, _MAX_RECENT_US) / spec.step_us), BACKFILL_STEPS)
-        super().__init__(spec.step_us, limits, most_recent, _COUNTS)
+        super().__init__(spec.step_us, limits, most_recent)
         self._spec = spec
         self._keep_us = keep_us
         self._centre_filter = centre_filter
@@ -525,7 +521,7 @@ class RhythmTracker(RegionTracker):
     def step(self, start_us: int, events: Events, occupied: Sequence[Region] = ()) -> list[TrackedRegion]:
         """See `RegionTracker`."""
         spec = self._spec
-        self.counts["steps_forgotten"] += self._store_step(start_us, events)
+        self._store_step(start_us, events)
         rises = self._detector.step(start_us, events, self._hits, CELL_SHIFT)
         end_us = start_us + spec.step_us
         boxes = self._predict_boxes(start_us + spec.step_us / 2, occupied)
