@@ -202,13 +202,14 @@ class Outputs:
             _sync(folder)
 
     def discard(self) -> None:
-        """Remove what has not come into place."""
+        """Remove what has not come into place; what has is no longer this one's."""
         for _, file in self._open:
             # A file that could not be written cannot be flushed either.
             with suppress(OSError):
                 file.close()
         for stage in self._stages.values():
             shutil.rmtree(stage, ignore_errors=True)
+        self._stages, self._staged, self._dropped, self._open = {}, {}, [], []
 
     def __enter__(self) -> Self:
         return self

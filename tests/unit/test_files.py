@@ -75,6 +75,18 @@ def test_an_earlier_file_stays_until_the_new_one_is_whole(tmp_path, monkeypatch)
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_file_that_was_committed_before_the_end_of_the_block_stays(tmp_path: Path) -> None:
+    with Outputs() as outputs:
+        outputs.write_text("one", tmp_path / "a")
+        outputs.commit()
+        assert (tmp_path / "a").read_text() == "one"
+        outputs.write_text("two", tmp_path / "b")
+    assert [(path.name, path.read_text()) for path in sorted(tmp_path.iterdir())] == [
+        ("a", "one"),
+        ("b", "two"),
+    ]
+
+
 def test_hidden_places_cannot_be_known_before(tmp_path: Path) -> None:
     """Who plants links under the names that a process would use reaches nothing."""
     victim = tmp_path / "victim"
