@@ -188,6 +188,9 @@ def _serve(
         for kind, server in servers.items():
             print_stderr(f"{_SERVED[kind]} at {server.url}")
         yield
+    for server in servers.values():
+        if server.dropped:
+            print_stderr(f"{server.url}: {server.dropped} results were not sent, as clients were too slow")
 
 
 def _exit_code(summary: dict[str, Any], interrupted: Path | None) -> int:

@@ -10,6 +10,8 @@ from datetime import UTC, datetime
 import pynmea2
 import pytest
 
+from evlcp_sdk.cli.live import ServingOptions, _serve
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.live import Publisher
 from evlcp_sdk.live.server import Server, serve
 from evlcp_sdk.live.tcp_output import TcpOutput
@@ -70,6 +72,15 @@ def test_a_client_that_stalls_or_leaves_costs_nothing(served: tuple[Publisher, d
             with suppress(TimeoutError):
                 got = link.recv(6)
         assert got == b"$INTXT"
+
+
+def test_the_command_reports_what_slow_clients_missed(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(TcpOutput, "dropped", 3)
+    with _serve(ServingOptions(nmea_port=0), Publisher(), [load_link()], "a.raw", None, None, None):
+        served = capsys.readouterr().err
+    assert served.startswith("evlcp: NMEA at ")
+    url = served.split()[-1]
+    assert capsys.readouterr().err == f"evlcp: {url}: 3 results were not sent, as clients were too slow\n"
 
 
 def test_gpsd_talks_once_it_is_asked(served: tuple[Publisher, dict[str, Server]]) -> None:
