@@ -16,8 +16,8 @@ ROWS = {
         *("results", "report", "study live", "run simulated surveying warming", "testing", "cli"),
     ),
     "evlcp_sdk/rx": (
-        *("_kernels", "boxes distortion limits", "rhythm sweeps", "guard regions trust", "detector framer"),
-        *("inbox placement ranges", "points spread", "alignment", "reflections reading"),
+        *("_kernels", "boxes distortion limits", "rhythm sweeps", "guard regions trust", "detector"),
+        *("inbox placement ranges", "points spread", "alignment reflections", "framer", "reading"),
         *("plugin_framing transmitters workers", "framing multi", "receiver"),
     ),
     "firmware_host": (

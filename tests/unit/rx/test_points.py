@@ -128,7 +128,7 @@ def simulated_errors(scene, sets, seed=None, lying=False):
     simulation = Simulation(load_scene(scene, sets), seed)
     frames = frames_of(receive_cut(LINK, Events.concat(list(simulation.stream())))[1])
     mine = [f for f in frames if np.isfinite(f.points_px).all() and lies(f.points_px) == lying]
-    bars = [bar.strips[0].strip.cuts_m() for bar in simulation.bars]
+    bars = [bar.strips[0].cuts_m() for bar in simulation.bars]
     cuts = next(cuts for cuts in bars if lies(cuts) == lying)
     at = simulation.path.sample(np.array([f.points_t_us for f in mine]) - simulation.scene.t0_us)
     want, _ = project((cuts[1:] + cuts[:-1]) / 2, *at, simulation.scene.camera)
