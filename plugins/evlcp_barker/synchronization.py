@@ -174,6 +174,7 @@ class BarkerSynchronizer:
         self._chips_per_part = 2 if is_pair_code(codebook.preamble) else 1
         self._due = due_chips(codebook.preamble)
         self._bin_us = packet.chip_us / _CHIP_STEPS
+        self._packet_us = packet.packet_us
         self._max_drift_us = spec.clock_tolerance_ppm * 1e-6 * packet.packet_chips * packet.chip_us
         rising = np.flatnonzero(np.diff(self._chips) > 0) + 1
         if not len(rising):
@@ -296,7 +297,7 @@ class BarkerSynchronizer:
 
     def _can_follow(self, before_us: float, rate_us: float, peak: _Peak, chips: int) -> bool:
         """Whether a peak may be whole packets after a preamble; the two are known to so many chips."""
-        packet_us = self._packet.packet_us + rate_us
+        packet_us = self._packet_us + rate_us
         apart_us = self._peak_us(peak) - before_us
         packets = round(apart_us / packet_us)
         off_us = abs(apart_us - packets * packet_us) - packets * self._max_drift_us
@@ -320,7 +321,7 @@ class BarkerSynchronizer:
     def _predict(self, clock: _Clock, packets: int) -> tuple[float, float, float, float]:
         """Time of the preamble so many packets after the lock's, and the variances there (see `_Clock`)."""
         time, both, rate = clock.variances
-        nominal_us = self._packet.packet_us
+        nominal_us = self._packet_us
         rate += (_WANDER_PPM * 1e-6 * nominal_us) ** 2 * packets * nominal_us * 1e-6
         time += 2 * packets * both + packets**2 * rate + packets * _LATENCY_SIGMA_US**2
         return clock.on_us + packets * (nominal_us + clock.rate_us), time, both + packets * rate, rate
@@ -330,7 +331,7 @@ class BarkerSynchronizer:
         if not self._can_follow(clock.on_us, clock.rate_us, peak, 1):
             return None
         found = self._refine_peak(peak)
-        packets = round((found.on.value - clock.on_us) / (self._packet.packet_us + clock.rate_us))
+        packets = round((found.on.value - clock.on_us) / (self._packet_us + clock.rate_us))
         if packets <= 0:
             return None
         expected, time, both, rate = self._predict(clock, packets)
