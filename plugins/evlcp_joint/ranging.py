@@ -159,18 +159,35 @@ def find_bar(
 ) -> tuple[NDArray[np.int16], Floats, Floats, NDArray[np.bool_]] | None:
     """Find a bar in the cells of a frame; None with fewer than three clusters in line.
 
+    Its line is that of least squares through all cells.
+
     Returns:
         Sums of the first `chips` chips and the offset of the bar along itself in each, turned so that it lies
         along the rows; its line, float64 (5,), as for `_kernels.read_rows`; and which clusters are seen.
     """
-    selected, sums = to_kernel_array(view.presence.selected), to_kernel_array(view.sums[:chips])
-    offset_px, middles = to_kernel_array(view.offset_px[1, :chips]), np.empty((len(selected), 2))
-    if _kernels.find_middles(selected, middles):
-        selected, sums = to_kernel_array(selected.swapaxes(1, 2)), to_kernel_array(sums.swapaxes(1, 2))
-        offset_px, middles = to_kernel_array(view.offset_px[0, :chips]), to_kernel_array(middles[:, ::-1])
-    line, seen = np.empty(5), np.empty(len(selected), np.bool_)
-    found = _kernels.find_line(selected, view.presence.grid_px, middles, line, seen)
-    return (sums, offset_px, line, seen) if found else None
+    selected, grid, sums, offset_px = view.presence.selected, view.presence.grid_px, view.sums, view.offset_px
+    cells = np.array(np.unravel_index(np.flatnonzero(selected), selected.shape), np.float64)
+    seen = np.bincount(cells[0].astype(np.int64), minlength=len(selected)) > 0
+    if seen.sum() < 3:
+        return None
+    mean = cells.mean(1)
+    off = cells - mean[:, None]
+    moments = (off @ off.T / cells.shape[1]).tolist()
+    along, across = (1, 2) if moments[1][1] >= moments[2][2] else (2, 1)
+    if moments[along][along] == 0:
+        return None
+    if along == 2:
+        sums, offset_px = sums.swapaxes(1, 2), offset_px[::-1]
+    spacing, tilt = moments[0][along] / moments[0][0], moments[1][2] / moments[along][along]
+    # Of n cells in a row the variance is (n^2 - 1) / 12.
+    wide = math.sqrt(12 * (moments[across][across] - tilt * moments[1][2]) + 1)
+    if abs(tilt) * math.sqrt(12 * moments[along][along]) * grid < 1:
+        # Upright to a pixel: all rows are read from the same columns.
+        tilt = 0.0
+    first, left, middle = mean[along] - spacing * mean[0], mean[across] - tilt * mean[along], (grid - 1) / 2
+    # In pixels, where a cell's number is that of its middle.
+    line = [first * grid + middle, spacing * grid, left * grid + middle * (1 - tilt), tilt, wide * grid / 2]
+    return to_kernel_array(sums[:chips]), to_kernel_array(offset_px[1, :chips]), np.array(line), seen
 
 
 @cache
