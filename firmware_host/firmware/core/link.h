@@ -30,12 +30,8 @@ struct evlcp_link {
     atomic_uint_least32_t tail;
     atomic_uint_least32_t overflow_errors;
 
-    uint8_t body[EVLCP_BODY_BYTES];
-    uint32_t length; /* bytes decoded */
-    uint8_t left;    /* bytes until the next COBS code */
-    bool full_block; /* the last code was 0xff: no zero follows its block */
-    bool open;       /* a byte came since the last delimiter */
-    bool broken;     /* too long: drop until the delimiter */
+    uint8_t body[EVLCP_WIRE_BYTES]; /* as it comes, then decoded; full: too long, drop until the delimiter */
+    uint32_t length;                /* bytes since the last delimiter */
     uint32_t crc_errors;
     uint32_t framing_errors;
 
@@ -47,7 +43,7 @@ struct evlcp_link {
 /* Take received bytes; those that find no room are counted as overflow. Safe in an interrupt. */
 void evlcp_link_push(struct evlcp_link *link, const uint8_t *bytes, uint32_t count);
 
-/* Next good datagram of what was received, or false. It stays valid until the next call. */
+/* Next good datagram of what was received, or false. It stays valid until one is put or the next is taken. */
 bool evlcp_link_next(struct evlcp_link *link, struct evlcp_datagram *datagram);
 
 /* Encode a datagram of at most EVLCP_MAX_PAYLOAD bytes payload for sending; the last one must be sent. */
