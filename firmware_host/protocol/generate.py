@@ -64,6 +64,8 @@ def _expand_message(table: Table) -> Table:
     request = parts["request"]
     return {
         "since": 0,
+        "needs": "",
+        "dark": False,
         **table,
         **parts,
         "request_bytes": sum(f["size"] for f in request),

@@ -9,16 +9,6 @@
 
 static const uint8_t dark[EVLCP_ROW_BYTES];
 
-/* A request on its way through its handler. */
-struct exchange {
-    uint16_t sequence;
-    const uint8_t *in;
-    uint32_t in_length;
-    uint8_t *out;
-    uint32_t out_length;
-    uint32_t detail;
-};
-
 static bool is_running(struct evlcp *e)
 {
     return atomic_load(&e->player.running);
@@ -412,8 +402,6 @@ static enum evlcp_status on_start(struct evlcp *e, struct exchange *x)
 static enum evlcp_status on_level(struct evlcp *e, struct exchange *x)
 {
     const struct evlcp_level_request request = evlcp_level_request_get(x->in);
-    if ((e->info.capabilities & EVLCP_CAPABILITY_LEVEL) == 0u)
-        return EVLCP_STATUS_NOT_SUPPORTED;
     if (request.level_ma > e->level_limit_ma)
         return out_of_range(x, e->level_limit_ma);
     uint32_t allowed = evlcp_allowed_duty(e, request.level_ma, e->duty_limit);
@@ -507,18 +495,6 @@ static enum evlcp_status on_watchdog(struct evlcp *e, struct exchange *x)
     return EVLCP_STATUS_OK;
 }
 
-static enum evlcp_status on_save(struct evlcp *e, struct exchange *x)
-{
-    struct evlcp_save_reply reply = {0};
-    uint8_t autostart = evlcp_get8(x->in);
-    if (autostart > 1u)
-        return out_of_range(x, 1u);
-    enum evlcp_status status = evlcp_settings_save(e, autostart == 1u, &reply);
-    if (status == EVLCP_STATUS_OK)
-        x->out_length = evlcp_save_reply_put(x->out, &reply);
-    return status;
-}
-
 static enum evlcp_status on_recall(struct evlcp *e, struct exchange *x)
 {
     struct evlcp_recall_reply reply = {0};
@@ -551,75 +527,6 @@ static enum evlcp_status on_led_test(struct evlcp *e, struct exchange *x)
     e->test.since_ms = hal_millis();
     show_test_led(e);
     return EVLCP_STATUS_OK;
-}
-
-/* Flash of an image is written and erased only in the dark: the processor of a single-bank part stands meanwhile. */
-static enum evlcp_status check_update_allowed(struct evlcp *e)
-{
-    if ((e->info.capabilities & EVLCP_CAPABILITY_UPDATE) == 0u)
-        return EVLCP_STATUS_NOT_SUPPORTED;
-    return is_running(e) || atomic_load(&e->player.want_play) || e->test.on ? EVLCP_STATUS_BUSY : EVLCP_STATUS_OK;
-}
-
-static enum evlcp_status on_update_status(struct evlcp *e, struct exchange *x)
-{
-    struct evlcp_update_status_reply reply = {0};
-    if ((e->info.capabilities & EVLCP_CAPABILITY_UPDATE) == 0u)
-        return EVLCP_STATUS_NOT_SUPPORTED;
-    evlcp_update_fill_status(&reply);
-    evlcp_copy(reply.target, e->info.target, sizeof reply.target);
-    x->out_length = evlcp_update_status_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
-}
-
-static enum evlcp_status on_update_write(struct evlcp *e, struct exchange *x)
-{
-    uint32_t offset = evlcp_get32(x->in);
-    uint32_t count = x->in_length - EVLCP_UPDATE_WRITE_REQUEST_BYTES;
-    enum evlcp_status status = check_update_allowed(e);
-    if (status == EVLCP_STATUS_OK)
-        status = evlcp_update_write(&e->update, offset, x->in + EVLCP_UPDATE_WRITE_REQUEST_BYTES, count, &x->detail);
-    if (status == EVLCP_STATUS_OK) {
-        const struct evlcp_update_write_reply reply = {.offset = offset, .count = (uint16_t)count};
-        x->out_length = evlcp_update_write_reply_put(x->out, &reply);
-    }
-    return status;
-}
-
-static enum evlcp_status on_update_begin(struct evlcp *e, struct exchange *x)
-{
-    const struct evlcp_update_begin_request request = evlcp_update_begin_request_get(x->in);
-    enum evlcp_status status = check_update_allowed(e);
-    return status == EVLCP_STATUS_OK ? evlcp_update_begin(&e->update, &request, &x->detail) : status;
-}
-
-static enum evlcp_status on_update_commit(struct evlcp *e, struct exchange *x)
-{
-    struct evlcp_update_commit_reply reply = {0};
-    enum evlcp_status status = check_update_allowed(e);
-    if (status == EVLCP_STATUS_OK)
-        status = evlcp_update_commit(&e->update, &reply.sequence, &x->detail);
-    if (status == EVLCP_STATUS_OK)
-        x->out_length = evlcp_update_commit_reply_put(x->out, &reply);
-    return status;
-}
-
-static enum evlcp_status on_update_restart(struct evlcp *e, struct exchange *x)
-{
-    (void)x;
-    enum evlcp_status status = check_update_allowed(e);
-    if (status == EVLCP_STATUS_OK) {
-        e->update.restart = true;
-        e->update.restart_ms = hal_millis();
-    }
-    return status;
-}
-
-static enum evlcp_status on_update_confirm(struct evlcp *e, struct exchange *x)
-{
-    (void)x;
-    enum evlcp_status status = check_update_allowed(e);
-    return status == EVLCP_STATUS_OK ? evlcp_update_confirm() : status;
 }
 
 /* No packet is taken from now on, and none of a stream is left for another START. */
@@ -660,6 +567,8 @@ struct shape {
     uint8_t type;
     bool control;
     bool query;
+    bool dark;
+    uint32_t needs; /* capability */
     bool open_ended;
     uint16_t least;
     uint16_t bytes;
@@ -683,10 +592,19 @@ static bool is_after(uint16_t sequence, uint16_t than)
     return (int16_t)(uint16_t)(sequence - than) > 0;
 }
 
+static enum evlcp_status run(struct evlcp *e, const struct shape *shape, struct exchange *x)
+{
+    if ((e->info.capabilities & shape->needs) != shape->needs)
+        return EVLCP_STATUS_NOT_SUPPORTED;
+    if (shape->dark && (is_running(e) || atomic_load(&e->player.want_play) || e->test.on))
+        return EVLCP_STATUS_BUSY;
+    return shape->handle(e, x);
+}
+
 static enum evlcp_status run_control(struct evlcp *e, const struct shape *shape, struct exchange *x)
 {
     struct evlcp_control *c = &e->control;
-    enum evlcp_status status = shape->handle(e, x);
+    enum evlcp_status status = run(e, shape, x);
     *c = (struct evlcp_control){.known = true,
                                 .type = shape->type,
                                 .status = (uint8_t)status,
@@ -761,7 +679,7 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
         return EVLCP_STATUS_STALE;
     if (shape->control)
         return run_control(e, shape, x);
-    enum evlcp_status status = shape->handle(e, x);
+    enum evlcp_status status = run(e, shape, x);
     if (trusted && d->type == EVLCP_TYPE_STATUS)
         e->watch.silence_from_ms = e->watch.host_ms; /* after it, as the status reports the silence */
     return status;
@@ -853,6 +771,8 @@ void evlcp_init(struct evlcp *e)
     (void)evlcp_set_light(e, e->info.level_default_ma, e->info.level_max_ma, 1000u);
     hal_read_health(&e->health);
     e->health_ms = hal_millis();
+    if ((e->info.capabilities & EVLCP_CAPABILITY_FLASH) == 0u)
+        return;
     evlcp_settings_load_key(e);
     struct evlcp_recall_reply recalled;
     uint32_t detail;

@@ -78,6 +78,16 @@ struct evlcp {
     uint8_t payload[EVLCP_MAX_PAYLOAD];
 };
 
+/* A request on its way through its handler. */
+struct exchange {
+    uint16_t sequence;
+    const uint8_t *in;
+    uint32_t in_length;
+    uint8_t *out;
+    uint32_t out_length;
+    uint32_t detail;
+};
+
 /* Begin, in memory that is zero: LEDs dark, no session; a flash slot saved with autostart is recalled and played. */
 void evlcp_init(struct evlcp *e);
 
@@ -94,8 +104,16 @@ void evlcp_hardware_failed(struct evlcp *e);
 /* Everything that is not urgent. */
 void evlcp_poll(struct evlcp *e);
 
-/* Saved settings; see settings.c. */
-enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct evlcp_save_reply *reply);
+/* Requests that are handled beside what they are about: in settings.c and update.c. */
+enum evlcp_status on_save(struct evlcp *e, struct exchange *x);
+enum evlcp_status on_update_status(struct evlcp *e, struct exchange *x);
+enum evlcp_status on_update_begin(struct evlcp *e, struct exchange *x);
+enum evlcp_status on_update_write(struct evlcp *e, struct exchange *x);
+enum evlcp_status on_update_commit(struct evlcp *e, struct exchange *x);
+enum evlcp_status on_update_restart(struct evlcp *e, struct exchange *x);
+enum evlcp_status on_update_confirm(struct evlcp *e, struct exchange *x);
+
+/* Take settings back from the newest good slot, or from none. */
 enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, struct evlcp_recall_reply *reply);
 
 /* Load the key of the newest valid slot. */

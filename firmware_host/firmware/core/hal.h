@@ -91,10 +91,10 @@ bool hal_set_level(uint16_t level_ma);
 void hal_read_health(struct evlcp_health *health);
 
 /* Two flash slots of at least EVLCP_SLOT_BYTES each, and, with EVLCP_CAPABILITY_UPDATE, two more of
-   EVLCP_IMAGE_SLOT_BYTES. Called only while no chip call runs. */
+   EVLCP_IMAGE_SLOT_BYTES. Called only while no chip call runs. What cannot be read may be anything: a CRC is over it. */
 bool hal_flash_erase(uint8_t slot);
 bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32_t count);
-bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count);
+void hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count);
 
 /* The image that runs: 0 the one that was flashed, 1 or 2 one that came by an update. */
 uint8_t hal_running_image(void);

@@ -8,8 +8,7 @@
 static bool get_slot(struct evlcp *e, uint8_t index, struct evlcp_saved *s)
 {
     uint8_t b[EVLCP_SAVED_BYTES];
-    if (!hal_flash_read(index, 0u, b, sizeof b))
-        return false;
+    hal_flash_read(index, 0u, b, sizeof b);
     *s = evlcp_saved_get(b);
     return s->magic == MAGIC && s->check == evlcp_crc32(0u, b, sizeof b - 4u) && s->chip_rate_hz != 0u &&
            e->info.tick_hz % s->chip_rate_hz == 0u && s->length <= EVLCP_BANK_BYTES;
@@ -23,14 +22,15 @@ static uint8_t newest(struct evlcp *e, struct evlcp_saved found[EVLCP_SLOTS], bo
     return valid[1] && (!valid[0] || (int32_t)(found[1].sequence - found[0].sequence) > 0) ? 1u : 0u;
 }
 
-enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct evlcp_save_reply *reply)
+enum evlcp_status on_save(struct evlcp *e, struct exchange *x)
 {
+    uint8_t autostart = evlcp_get8(x->in);
     uint8_t active = atomic_load(&e->banks.active);
     struct evlcp_saved found[EVLCP_SLOTS];
     bool valid[EVLCP_SLOTS];
     uint8_t header[EVLCP_SAVED_BYTES];
-    if ((e->info.capabilities & EVLCP_CAPABILITY_FLASH) == 0u)
-        return EVLCP_STATUS_NOT_SUPPORTED;
+    if (autostart > 1u)
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, &x->detail, 1u);
     /* Erasing stops the processor on single-bank parts: chips would come late, a LED test would stand still. */
     if (atomic_load(&e->player.running) || atomic_load(&e->player.want_play) || e->test.on)
         return EVLCP_STATUS_BUSY;
@@ -44,7 +44,7 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
     const struct evlcp_setup *setup = &plan->setup;
     struct evlcp_saved slot = {.magic = MAGIC,
                               .sequence = sequence,
-                              .autostart = autostart ? 1u : 0u,
+                              .autostart = autostart,
                               .watchdog = e->watch.action,
                               .level_ma = e->level_ma,
                               .watchdog_ms = e->watch.timeout_ms,
@@ -79,13 +79,12 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
         !hal_flash_write(to, 0u, header, sizeof header))
         return EVLCP_STATUS_FLASH_FAULT;
     /* Read back what the flash took. */
-    uint32_t crc;
     struct evlcp_saved back;
-    if (!evlcp_flash_crc(to, EVLCP_SAVED_BYTES, slot.length, &crc) || crc != slot.crc || !get_slot(e, to, &back) ||
+    if (evlcp_flash_crc(to, EVLCP_SAVED_BYTES, slot.length) != slot.crc || !get_slot(e, to, &back) ||
         back.sequence != sequence)
         return EVLCP_STATUS_FLASH_FAULT;
-    reply->slot = to;
-    reply->save_sequence = sequence;
+    const struct evlcp_save_reply reply = {.slot = to, .save_sequence = sequence};
+    x->out_length = evlcp_save_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
 
@@ -114,8 +113,7 @@ static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct evlcp
     evlcp_copy(setup.digest, s->digest, sizeof setup.digest);
     evlcp_copy(request.digest, s->digest, sizeof request.digest);
     e->banks.plan[bank].valid = false;
-    if (!hal_flash_read(index, EVLCP_SAVED_BYTES, e->banks.content[bank], s->length))
-        return EVLCP_STATUS_FLASH_FAULT;
+    hal_flash_read(index, EVLCP_SAVED_BYTES, e->banks.content[bank], s->length);
     enum evlcp_status status = evlcp_banks_check(&e->banks, &setup, &request, &detail);
     if (status != EVLCP_STATUS_OK)
         return status;
@@ -135,8 +133,6 @@ enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, st
 {
     struct evlcp_saved found[EVLCP_SLOTS];
     bool valid[EVLCP_SLOTS];
-    if ((e->info.capabilities & EVLCP_CAPABILITY_FLASH) == 0u)
-        return EVLCP_STATUS_NOT_SUPPORTED;
     if (atomic_load(&e->player.running) || atomic_load(&e->banks.pending) != EVLCP_NO_BANK || e->test.on)
         return EVLCP_STATUS_BUSY;
     uint8_t first = newest(e, found, valid);
@@ -160,8 +156,6 @@ void evlcp_settings_load_key(struct evlcp *e)
 {
     struct evlcp_saved found[EVLCP_SLOTS];
     bool valid[EVLCP_SLOTS];
-    if ((e->info.capabilities & EVLCP_CAPABILITY_FLASH) == 0u)
-        return;
     /* Not that of an older slot, whatever RECALL does: a key that was changed is not believed again. */
     uint8_t last = newest(e, found, valid);
     if (valid[last])

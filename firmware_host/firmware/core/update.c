@@ -1,7 +1,6 @@
-#include "update.h"
-
+/* UPDATE_*: two flash slots for images, written in turn, each with a seal behind it. */
 #include "crc32.h"
-#include "hal.h"
+#include "evlcp.h"
 
 #define MAGIC 0x45564c55u
 #define CHUNK 256u
@@ -12,46 +11,44 @@
 #define TRIES_AT (SEAL_AT + 32u)
 #define CONFIRMED_AT (SEAL_AT + 48u)
 
+static uint8_t slot_of(uint8_t image)
+{
+    return (uint8_t)(EVLCP_IMAGE_SLOT + image);
+}
+
 static uint32_t read_word(uint8_t image, uint32_t offset)
 {
     uint8_t bytes[4];
-    return hal_flash_read((uint8_t)(EVLCP_IMAGE_SLOT + image), offset, bytes, 4u) ? evlcp_get32(bytes) : 0u;
+    hal_flash_read(slot_of(image), offset, bytes, sizeof bytes);
+    return evlcp_get32(bytes);
 }
 
 static bool clear_word(uint8_t image, uint32_t offset)
 {
     static const uint8_t zero[4];
-    return hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + image), offset, zero, 4u) && read_word(image, offset) == 0u;
+    return hal_flash_write(slot_of(image), offset, zero, sizeof zero) && read_word(image, offset) == 0u;
 }
 
-bool evlcp_flash_crc(uint8_t slot, uint32_t offset, uint32_t length, uint32_t *crc)
+uint32_t evlcp_flash_crc(uint8_t slot, uint32_t offset, uint32_t length)
 {
-    *crc = 0u;
+    uint32_t crc = 0u;
     for (uint32_t at = 0; at < length; at += CHUNK) {
         uint8_t bytes[CHUNK];
         uint32_t count = length - at < CHUNK ? length - at : CHUNK;
-        if (!hal_flash_read(slot, offset + at, bytes, count))
-            return false;
-        *crc = evlcp_crc32(*crc, bytes, count);
+        hal_flash_read(slot, offset + at, bytes, count);
+        crc = evlcp_crc32(crc, bytes, count);
     }
-    return true;
-}
-
-static bool image_crc(uint8_t image, uint32_t length, uint32_t *crc)
-{
-    return evlcp_flash_crc((uint8_t)(EVLCP_IMAGE_SLOT + image), 0u, length, crc);
+    return crc;
 }
 
 /* Whether a place has a whole image. */
 static bool has_valid_image(uint8_t image, struct evlcp_image_seal *seal)
 {
     uint8_t b[EVLCP_IMAGE_SEAL_BYTES];
-    uint32_t crc;
-    if (!hal_flash_read((uint8_t)(EVLCP_IMAGE_SLOT + image), SEAL_AT, b, sizeof b))
-        return false;
+    hal_flash_read(slot_of(image), SEAL_AT, b, sizeof b);
     *seal = evlcp_image_seal_get(b);
     return seal->magic == MAGIC && seal->check == evlcp_crc32(0u, b, sizeof b - 4u) &&
-           seal->length <= EVLCP_IMAGE_BYTES && image_crc(image, seal->length, &crc) && crc == seal->crc;
+           seal->length <= EVLCP_IMAGE_BYTES && evlcp_flash_crc(slot_of(image), 0u, seal->length) == seal->crc;
 }
 
 static bool is_newer(uint32_t a, uint32_t b)
@@ -117,69 +114,85 @@ static bool is_on_trial(void)
     return running != 0u && !is_confirmed((uint8_t)(running - 1u));
 }
 
-void evlcp_update_fill_status(struct evlcp_update_status_reply *reply)
+enum evlcp_status on_update_status(struct evlcp *e, struct exchange *x)
 {
-    reply->running = hal_running_image();
-    reply->trial = is_on_trial() ? 1u : 0u;
-    reply->next = (uint8_t)(next_image(&reply->sequence) + 1u);
-    reply->capacity = EVLCP_IMAGE_BYTES;
+    struct evlcp_update_status_reply reply = {
+        .running = hal_running_image(), .trial = is_on_trial() ? 1u : 0u, .capacity = EVLCP_IMAGE_BYTES};
+    reply.next = (uint8_t)(next_image(&reply.sequence) + 1u);
+    evlcp_copy(reply.target, e->info.target, sizeof reply.target);
+    x->out_length = evlcp_update_status_reply_put(x->out, &reply);
+    return EVLCP_STATUS_OK;
 }
 
-enum evlcp_status evlcp_update_begin(struct evlcp_update *u, const struct evlcp_update_begin_request *request,
-                                     uint32_t *detail)
+enum evlcp_status on_update_begin(struct evlcp *e, struct exchange *x)
 {
+    const struct evlcp_update_begin_request request = evlcp_update_begin_request_get(x->in);
     uint32_t newest;
     uint8_t image = next_image(&newest);
     if (is_on_trial()) /* the image before it must stay until this one has proven itself */
         return EVLCP_STATUS_BUSY;
-    if (request->image != image + 1u)
-        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, image + 1u);
-    if (request->length == 0u || request->length > EVLCP_IMAGE_BYTES)
-        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, EVLCP_IMAGE_BYTES);
-    u->open = hal_flash_erase((uint8_t)(EVLCP_IMAGE_SLOT + image));
-    u->image = image;
-    u->length = request->length;
-    u->crc = request->crc;
-    return u->open ? EVLCP_STATUS_OK : EVLCP_STATUS_FLASH_FAULT;
+    if (request.image != image + 1u)
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, &x->detail, image + 1u);
+    if (request.length == 0u || request.length > EVLCP_IMAGE_BYTES)
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, &x->detail, EVLCP_IMAGE_BYTES);
+    e->update.open = hal_flash_erase(slot_of(image));
+    e->update.image = image;
+    e->update.length = request.length;
+    e->update.crc = request.crc;
+    return e->update.open ? EVLCP_STATUS_OK : EVLCP_STATUS_FLASH_FAULT;
 }
 
-enum evlcp_status evlcp_update_write(const struct evlcp_update *u, uint32_t offset, const uint8_t *bytes,
-                                     uint32_t count, uint32_t *detail)
+enum evlcp_status on_update_write(struct evlcp *e, struct exchange *x)
 {
+    const struct evlcp_update *u = &e->update;
+    uint32_t offset = evlcp_get32(x->in);
+    uint32_t count = x->in_length - EVLCP_UPDATE_WRITE_REQUEST_BYTES;
     if (!u->open)
         return EVLCP_STATUS_NOTHING_COMMITTED;
     if (offset % 4u != 0u || offset > u->length || count > u->length - offset)
-        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, u->length);
-    return hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + u->image), offset, bytes, count)
-               ? EVLCP_STATUS_OK
-               : EVLCP_STATUS_FLASH_FAULT;
-}
-
-enum evlcp_status evlcp_update_commit(struct evlcp_update *u, uint32_t *sequence, uint32_t *detail)
-{
-    uint8_t b[EVLCP_IMAGE_SEAL_BYTES];
-    if (!u->open)
-        return EVLCP_STATUS_NOTHING_COMMITTED;
-    if (!image_crc(u->image, u->length, detail))
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, &x->detail, u->length);
+    if (!hal_flash_write(slot_of(u->image), offset, x->in + EVLCP_UPDATE_WRITE_REQUEST_BYTES, count))
         return EVLCP_STATUS_FLASH_FAULT;
-    if (*detail != u->crc)
-        return EVLCP_STATUS_BAD_CRC;
-    (void)next_image(sequence);
-    *sequence += 1u;
-    u->open = false;
-    struct evlcp_image_seal seal = {.magic = MAGIC, .sequence = *sequence, .length = u->length, .crc = u->crc};
-    (void)evlcp_image_seal_put(b, &seal);
-    evlcp_put32(b + sizeof b - 4u, evlcp_crc32(0u, b, sizeof b - 4u));
-    if (!hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + u->image), SEAL_AT, b, sizeof b) ||
-        !has_valid_image(u->image, &seal))
-        return EVLCP_STATUS_FLASH_FAULT;
+    const struct evlcp_update_write_reply reply = {.offset = offset, .count = (uint16_t)count};
+    x->out_length = evlcp_update_write_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
 
-enum evlcp_status evlcp_update_confirm(void)
+enum evlcp_status on_update_commit(struct evlcp *e, struct exchange *x)
 {
-    uint8_t running = hal_running_image();
-    if (!is_on_trial())
+    struct evlcp_update *u = &e->update;
+    struct evlcp_update_commit_reply reply;
+    uint8_t b[EVLCP_IMAGE_SEAL_BYTES];
+    if (!u->open)
+        return EVLCP_STATUS_NOTHING_COMMITTED;
+    x->detail = evlcp_flash_crc(slot_of(u->image), 0u, u->length);
+    if (x->detail != u->crc)
+        return EVLCP_STATUS_BAD_CRC;
+    (void)next_image(&reply.sequence);
+    reply.sequence++;
+    u->open = false;
+    struct evlcp_image_seal seal = {.magic = MAGIC, .sequence = reply.sequence, .length = u->length, .crc = u->crc};
+    (void)evlcp_image_seal_put(b, &seal);
+    evlcp_put32(b + sizeof b - 4u, evlcp_crc32(0u, b, sizeof b - 4u));
+    if (!hal_flash_write(slot_of(u->image), SEAL_AT, b, sizeof b) || !has_valid_image(u->image, &seal))
+        return EVLCP_STATUS_FLASH_FAULT;
+    x->out_length = evlcp_update_commit_reply_put(x->out, &reply);
+    return EVLCP_STATUS_OK;
+}
+
+enum evlcp_status on_update_restart(struct evlcp *e, struct exchange *x)
+{
+    (void)x;
+    e->update.restart = true;
+    e->update.restart_ms = hal_millis();
+    return EVLCP_STATUS_OK;
+}
+
+enum evlcp_status on_update_confirm(struct evlcp *e, struct exchange *x)
+{
+    (void)e;
+    (void)x;
+    if (!is_on_trial() || clear_word((uint8_t)(hal_running_image() - 1u), CONFIRMED_AT))
         return EVLCP_STATUS_OK;
-    return clear_word((uint8_t)(running - 1u), CONFIRMED_AT) ? EVLCP_STATUS_OK : EVLCP_STATUS_FLASH_FAULT;
+    return EVLCP_STATUS_FLASH_FAULT;
 }

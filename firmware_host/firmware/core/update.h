@@ -23,22 +23,11 @@ struct evlcp_update {
     uint32_t restart_ms;
 };
 
-/* CRC-32 of a part of a flash slot. False if it cannot be read. */
-bool evlcp_flash_crc(uint8_t slot, uint32_t offset, uint32_t length, uint32_t *crc);
+/* CRC-32 of a part of a flash slot. */
+uint32_t evlcp_flash_crc(uint8_t slot, uint32_t offset, uint32_t length);
 
 /* Which image to run after a reset, 1 or 2, or 0 for the one that was flashed; a trial's count goes down. Called
    once, before anything else, by the image that was flashed. */
 uint8_t evlcp_update_pick_image(void);
-
-/* Fill the reply to UPDATE_STATUS, but for the target. */
-void evlcp_update_fill_status(struct evlcp_update_status_reply *reply);
-
-/* Requests, with the LEDs dark. */
-enum evlcp_status evlcp_update_begin(struct evlcp_update *u, const struct evlcp_update_begin_request *request,
-                                     uint32_t *detail);
-enum evlcp_status evlcp_update_write(const struct evlcp_update *u, uint32_t offset, const uint8_t *bytes,
-                                     uint32_t count, uint32_t *detail);
-enum evlcp_status evlcp_update_commit(struct evlcp_update *u, uint32_t *sequence, uint32_t *detail);
-enum evlcp_status evlcp_update_confirm(void);
 
 #endif

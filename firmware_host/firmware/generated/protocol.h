@@ -964,34 +964,35 @@ static inline struct evlcp_image_seal evlcp_image_seal_get(const uint8_t *p)
 
 #define EVLCP_REQUEST_MOST 69u /* longest request, data left out */
 
-/* Requests: name, type, whether control, whether a query, whether any length may follow, and the length,
-   that of the first minor version and today's; a shorter one goes on with zeros. */
+/* Requests: name, type, whether control, whether a query, whether only in the dark, the capability that it needs,
+   whether any length may follow, and the length, that of the first minor version and today's; a shorter one goes on
+   with zeros. */
 #define EVLCP_REQUESTS(X) \
-    X(hello, 0x01u, false, false, true, 6u, 6u) \
-    X(configure, 0x02u, true, false, false, 12u, 12u) \
-    X(codebook, 0x03u, true, false, false, 69u, 69u) \
-    X(write, 0x04u, false, false, true, 5u, 5u) \
-    X(read, 0x05u, false, true, false, 7u, 7u) \
-    X(crc, 0x06u, false, true, false, 9u, 9u) \
-    X(commit, 0x07u, true, false, false, 44u, 44u) \
-    X(start, 0x08u, true, false, false, 0u, 10u) \
-    X(stop, 0x09u, true, false, false, 0u, 0u) \
-    X(blank, 0x0au, true, false, false, 0u, 0u) \
-    X(level, 0x0bu, true, false, false, 2u, 2u) \
-    X(status, 0x0cu, false, true, false, 0u, 0u) \
-    X(watchdog, 0x0du, true, false, false, 5u, 5u) \
-    X(save, 0x0eu, true, false, false, 1u, 1u) \
-    X(recall, 0x0fu, true, false, false, 0u, 0u) \
-    X(led_test, 0x10u, true, false, false, 4u, 4u) \
-    X(stream, 0x18u, true, false, false, 34u, 34u) \
-    X(push, 0x19u, false, false, true, 8u, 8u) \
-    X(key, 0x1au, true, false, false, 16u, 16u) \
-    X(chips, 0x1bu, true, false, false, 38u, 38u) \
-    X(update_status, 0x20u, false, true, false, 0u, 0u) \
-    X(update_begin, 0x21u, true, false, false, 9u, 9u) \
-    X(update_write, 0x22u, false, false, true, 4u, 4u) \
-    X(update_commit, 0x23u, true, false, false, 0u, 0u) \
-    X(update_restart, 0x24u, true, false, false, 0u, 0u) \
-    X(update_confirm, 0x25u, true, false, false, 0u, 0u)
+    X(hello, 0x01u, false, false, false, 0u, true, 6u, 6u) \
+    X(configure, 0x02u, true, false, false, 0u, false, 12u, 12u) \
+    X(codebook, 0x03u, true, false, false, 0u, false, 69u, 69u) \
+    X(write, 0x04u, false, false, false, 0u, true, 5u, 5u) \
+    X(read, 0x05u, false, true, false, 0u, false, 7u, 7u) \
+    X(crc, 0x06u, false, true, false, 0u, false, 9u, 9u) \
+    X(commit, 0x07u, true, false, false, 0u, false, 44u, 44u) \
+    X(start, 0x08u, true, false, false, 0u, false, 0u, 10u) \
+    X(stop, 0x09u, true, false, false, 0u, false, 0u, 0u) \
+    X(blank, 0x0au, true, false, false, 0u, false, 0u, 0u) \
+    X(level, 0x0bu, true, false, false, EVLCP_CAPABILITY_LEVEL, false, 2u, 2u) \
+    X(status, 0x0cu, false, true, false, 0u, false, 0u, 0u) \
+    X(watchdog, 0x0du, true, false, false, 0u, false, 5u, 5u) \
+    X(save, 0x0eu, true, false, false, EVLCP_CAPABILITY_FLASH, false, 1u, 1u) \
+    X(recall, 0x0fu, true, false, false, EVLCP_CAPABILITY_FLASH, false, 0u, 0u) \
+    X(led_test, 0x10u, true, false, false, 0u, false, 4u, 4u) \
+    X(stream, 0x18u, true, false, false, 0u, false, 34u, 34u) \
+    X(push, 0x19u, false, false, false, 0u, true, 8u, 8u) \
+    X(key, 0x1au, true, false, false, 0u, false, 16u, 16u) \
+    X(chips, 0x1bu, true, false, false, 0u, false, 38u, 38u) \
+    X(update_status, 0x20u, false, true, false, EVLCP_CAPABILITY_UPDATE, false, 0u, 0u) \
+    X(update_begin, 0x21u, true, false, true, EVLCP_CAPABILITY_UPDATE, false, 9u, 9u) \
+    X(update_write, 0x22u, false, false, true, EVLCP_CAPABILITY_UPDATE, true, 4u, 4u) \
+    X(update_commit, 0x23u, true, false, true, EVLCP_CAPABILITY_UPDATE, false, 0u, 0u) \
+    X(update_restart, 0x24u, true, false, true, EVLCP_CAPABILITY_UPDATE, false, 0u, 0u) \
+    X(update_confirm, 0x25u, true, false, true, EVLCP_CAPABILITY_UPDATE, false, 0u, 0u)
 
 #endif

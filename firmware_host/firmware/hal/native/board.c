@@ -228,11 +228,10 @@ bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32
     return !self->bench.flash_fails && !cut;
 }
 
-bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count)
+void hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count)
 {
     uint32_t size;
     memcpy(bytes, slot_of(slot, &size) + offset, count);
-    return true;
 }
 
 uint8_t hal_running_image(void)

@@ -721,11 +721,10 @@ bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32
     return good;
 }
 
-bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count)
+void hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count)
 {
     evlcp_copy(bytes, (const uint8_t *)(SLOT_ADDRESS(slot) + offset), count);
     IWDG_KR = IWDG_FEED; /* at 16 MHz two images are checked for longer than it waits */
-    return true;
 }
 
 uint8_t hal_running_image(void)
