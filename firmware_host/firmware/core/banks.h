@@ -1,6 +1,5 @@
 /* Banks of content, and which of them plays. */
-#ifndef EVLCP_BANKS_H
-#define EVLCP_BANKS_H
+#pragma once
 
 #include <stdatomic.h>
 #include <stdbool.h>
@@ -48,5 +47,3 @@ enum evlcp_status evlcp_banks_stream(struct evlcp_banks *banks, const struct evl
 
 /* Make the pending bank active, if there is one. True if it changed. */
 bool evlcp_banks_swap(struct evlcp_banks *banks);
-
-#endif

@@ -23,7 +23,8 @@ void evlcp_cursor_seek(struct evlcp_cursor *cursor, const struct evlcp_plan *pla
                                     .at = content + plan->table_bytes + packet * plan->packet_bytes};
 }
 
-void evlcp_row_of_mask(uint16_t mask, uint8_t row[EVLCP_ROW_BYTES])
+/* Spread a mask, cluster 0 its most significant bit, over the LEDs. */
+static void row_of_mask(uint16_t mask, uint8_t row[EVLCP_ROW_BYTES])
 {
     /* Four clusters are 24 LEDs are three bytes. */
     for (uint32_t group = 0; group < 4u; group++) {
@@ -106,9 +107,9 @@ bool evlcp_cursor_row(struct evlcp_cursor *cursor, uint8_t row[EVLCP_ROW_BYTES])
         }
     } else if (cursor->chip < plan->setup.preamble_chips) {
         uint32_t on = plan->setup.preamble >> (plan->setup.preamble_chips - 1u - cursor->chip) & 1u;
-        evlcp_row_of_mask(on ? 0xffffu : 0u, row);
+        row_of_mask(on ? 0xffffu : 0u, row);
     } else {
-        evlcp_row_of_mask(frame_mask(cursor), row);
+        row_of_mask(frame_mask(cursor), row);
         if (++cursor->in_frame == EVLCP_FRAME_CHIPS) {
             cursor->at += EVLCP_FRAME_BYTES;
             cursor->to_pilot = (uint8_t)((cursor->to_pilot == 0u ? plan->setup.pilot_every : cursor->to_pilot) - 1u);

@@ -1,6 +1,5 @@
 /* Chips from a bank's content: preamble, pilots and info words become LED rows. */
-#ifndef EVLCP_COMPOSER_H
-#define EVLCP_COMPOSER_H
+#pragma once
 
 #include <stdbool.h>
 #include <stdint.h>
@@ -64,8 +63,3 @@ void evlcp_cursor_seek(struct evlcp_cursor *cursor, const struct evlcp_plan *pla
 
 /* The row of the chip at the cursor; the cursor moves on. True if it was the packet's last. */
 bool evlcp_cursor_row(struct evlcp_cursor *cursor, uint8_t row[EVLCP_ROW_BYTES]);
-
-/* Spread a mask, cluster 0 its most significant bit, over the LEDs. */
-void evlcp_row_of_mask(uint16_t mask, uint8_t row[EVLCP_ROW_BYTES]);
-
-#endif

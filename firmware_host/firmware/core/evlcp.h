@@ -1,7 +1,6 @@
 /* The board: answers requests, plays chips. The HAL owns one, calls evlcp_init once, evlcp_receive from the
    receive interrupt, evlcp_chip from the chip interrupt (the highest priority) and evlcp_poll without pause. */
-#ifndef EVLCP_H
-#define EVLCP_H
+#pragma once
 
 #include "banks.h"
 #include "hal.h"
@@ -127,5 +126,3 @@ bool evlcp_set_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma
 
 /* Make a checked bank active: now if nothing plays, else at the packet boundary. */
 void evlcp_activate(struct evlcp *e, uint8_t bank);
-
-#endif

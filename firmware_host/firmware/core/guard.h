@@ -1,7 +1,6 @@
 /* Limits of light, kept on the rows that are sent: over any stretch of n chips a LED is on for at most
    n * duty / 1000 chips and the burst. */
-#ifndef EVLCP_GUARD_H
-#define EVLCP_GUARD_H
+#pragma once
 
 #include <stdatomic.h>
 #include <stdbool.h>
@@ -27,5 +26,3 @@ void evlcp_guard_add_dark(struct evlcp_guard *guard, uint32_t chips);
 /* Share of time that a LED is on when the content is played over and over, that of the brightest, permille, rounded
    up. */
 uint16_t evlcp_guard_duty(const struct evlcp_plan *plan, const uint8_t *content);
-
-#endif

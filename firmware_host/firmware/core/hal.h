@@ -1,6 +1,5 @@
 /* What the core asks of the hardware: the only way from the core to the outside. */
-#ifndef EVLCP_HAL_H
-#define EVLCP_HAL_H
+#pragma once
 
 #include <stdbool.h>
 #include <stdint.h>
@@ -101,5 +100,3 @@ uint8_t hal_running_image(void);
 
 /* Reset; it may return before that happens. */
 void hal_restart(void);
-
-#endif

@@ -1,6 +1,5 @@
 /* Datagrams over a byte line: receive ring, COBS, CRC. */
-#ifndef EVLCP_LINK_H
-#define EVLCP_LINK_H
+#pragma once
 
 #include <stdatomic.h>
 #include <stdbool.h>
@@ -51,5 +50,3 @@ void evlcp_link_put(struct evlcp_link *link, const struct evlcp_datagram *datagr
 
 /* Hand encoded bytes to hal_send; true when all are gone. */
 bool evlcp_link_flush(struct evlcp_link *link);
-
-#endif

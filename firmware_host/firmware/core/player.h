@@ -1,6 +1,5 @@
 /* Plays the active bank chip by chip; swaps banks only between packets. */
-#ifndef EVLCP_PLAYER_H
-#define EVLCP_PLAYER_H
+#pragma once
 
 #include <stdatomic.h>
 #include <stdbool.h>
@@ -43,5 +42,3 @@ void evlcp_player_blank(struct evlcp_player *player);
 
 /* One chip: called by the HAL's chip interrupt. */
 void evlcp_player_chip(struct evlcp_player *player, struct evlcp_banks *banks);
-
-#endif

@@ -1,6 +1,5 @@
 /* SHA-256 (FIPS 180-4), and what HMAC (RFC 2104) needs of it. */
-#ifndef EVLCP_SHA256_H
-#define EVLCP_SHA256_H
+#pragma once
 
 #include <stdint.h>
 
@@ -22,5 +21,3 @@ void evlcp_sha256_end(struct evlcp_sha256 *hash, uint8_t digest[EVLCP_SHA256_BYT
 
 /* Begin the inner or outer hash of an HMAC, with a key of at most EVLCP_SHA256_BLOCK bytes. */
 void evlcp_sha256_begin_keyed(struct evlcp_sha256 *hash, const uint8_t *key, uint32_t count, uint8_t pad);
-
-#endif

@@ -1,6 +1,5 @@
 /* A bank as a queue of packets: the host puts them in, the player takes them out. */
-#ifndef EVLCP_STREAM_H
-#define EVLCP_STREAM_H
+#pragma once
 
 #include <stdatomic.h>
 #include <stdbool.h>
@@ -48,5 +47,3 @@ bool evlcp_stream_is_over(const struct evlcp_stream *stream);
 /* Take the next packet out, at a packet boundary; what it held before may be overwritten from now on. `hold`: not
    now, show the idle pattern. */
 enum evlcp_stream_next evlcp_stream_take(struct evlcp_stream *stream, bool hold, uint32_t *slot);
-
-#endif

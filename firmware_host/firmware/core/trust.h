@@ -1,6 +1,5 @@
 /* A key that requests which change something must be sealed with; see docs/protocol.md. */
-#ifndef EVLCP_TRUST_H
-#define EVLCP_TRUST_H
+#pragma once
 
 #include <stdbool.h>
 #include <stdint.h>
@@ -27,5 +26,3 @@ void evlcp_trust_begin_session(struct evlcp_trust *trust, uint16_t sequence);
 
 /* Remove the seal of a request of the session; *sealed: whether it had a valid one by the board's key. */
 enum evlcp_status evlcp_trust_unseal(struct evlcp_trust *trust, struct evlcp_datagram *datagram, bool *sealed);
-
-#endif

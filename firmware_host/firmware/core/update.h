@@ -1,7 +1,6 @@
 /* Updates in the field: two places for images beside the one that was flashed, written in turn. A new image runs on
    trial: it must be confirmed before the third reset, or the one before it runs again. */
-#ifndef EVLCP_UPDATE_H
-#define EVLCP_UPDATE_H
+#pragma once
 
 #include <stdbool.h>
 #include <stdint.h>
@@ -29,5 +28,3 @@ uint32_t evlcp_flash_crc(uint8_t slot, uint32_t offset, uint32_t length);
 /* Which image to run after a reset, 1 or 2, or 0 for the one that was flashed; a trial's count goes down. Called
    once, before anything else, by the image that was flashed. */
 uint8_t evlcp_update_pick_image(void);
-
-#endif

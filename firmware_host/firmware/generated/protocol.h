@@ -1,6 +1,5 @@
 /* Messages of the driver board; generated from protocol.toml, do not edit. */
-#ifndef EVLCP_PROTOCOL_H
-#define EVLCP_PROTOCOL_H
+#pragma once
 #include <stdint.h>
 
 #define EVLCP_PROTOCOL_MAJOR 2u
@@ -994,5 +993,3 @@ static inline struct evlcp_image_seal evlcp_image_seal_get(const uint8_t *p)
     X(update_commit, 0x23u, true, false, true, EVLCP_CAPABILITY_UPDATE, false, 0u, 0u) \
     X(update_restart, 0x24u, true, false, true, EVLCP_CAPABILITY_UPDATE, false, 0u, 0u) \
     X(update_confirm, 0x25u, true, false, true, EVLCP_CAPABILITY_UPDATE, false, 0u, 0u)
-
-#endif

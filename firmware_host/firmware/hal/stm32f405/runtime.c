@@ -4,7 +4,6 @@
 
 void *memcpy(void *to, const void *from, size_t count);
 void *memset(void *to, int value, size_t count);
-void *memmove(void *to, const void *from, size_t count);
 
 void *memcpy(void *to, const void *from, size_t count)
 {
@@ -20,16 +19,5 @@ void *memset(void *to, int value, size_t count)
     uint8_t *t = to;
     while (count-- != 0u)
         *t++ = (uint8_t)value;
-    return to;
-}
-
-void *memmove(void *to, const void *from, size_t count)
-{
-    uint8_t *t = to;
-    const uint8_t *f = from;
-    if (t < f)
-        return memcpy(to, from, count);
-    while (count-- != 0u)
-        t[count] = f[count];
     return to;
 }
