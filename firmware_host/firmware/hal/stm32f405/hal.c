@@ -25,18 +25,8 @@
    chip before was early; TIM3 counts only while TIM1 runs then. So both stay together, and an error of the crystal of
    up to 350 ppm goes into the stops. TIM2 takes the time of each pulse by itself.
 
-   Dark is output enable, a pin that needs neither the stream nor a timer. What sets it by itself:
-
-   | what fails                              | what notices, and when                                  |
-   |-----------------------------------------|---------------------------------------------------------|
-   | no chip comes: TIM1, DMA, its interrupt | SysTick, which every chip restarts, after 1.5 chips;    |
-   |                                         | the main loop by TIM2, after 1.5 chips                  |
-   | the stream: transfer, direct mode, FIFO | its interrupt, at once                                  |
-   | SPI1 takes no word, TIM3 stands         | the main loop, after 1.5 chips, 5 ms more during a CRC  |
-   | the crystal                             | clock security (NMI), at once; then 16 MHz, no chips    |
-   | the supply is below 2.8 V               | PVD interrupt, at once; brown-out reset (option bytes)  |
-   | the core: an exception                  | fault_handler, at once; then the watchdog's reset       |
-   | the main loop hangs, the core stands    | independent watchdog on the LSI: reset in 70 to 190 ms  |
+   Dark is output enable, a pin that needs neither the stream nor a timer. What sets it by itself, and when, is a table
+   of docs/transmitter.md. SysTick is restarted by every chip; the main loop looks at SPI1, TIM3 and TIM2.
 
    Reset leaves PB0 an input: the pull-up on the board is what keeps the LEDs dark then. A board that comes from the
    watchdog's reset stays dark, with CHIP_LOST, until START, even if a slot says autostart. */
