@@ -63,7 +63,7 @@ def stm32() -> None:
         board.write_missing(0, bank.content)
         sizes = (bank.format, bank.packets, len(bank.content), bank.crc)
         began = chip.now
-        board.session.call(CommitRequest(0, *sizes, bytes.fromhex(bank.digest)))
+        board.session.call(CommitRequest(0, *sizes, bank.digest))
         commit_ms = (chip.now - began) / US / 1e3
         board.start()
         chip.run(10_000)

@@ -103,9 +103,9 @@ class Bank:
         return len(self.chips) // self.link.packet.packet_chips
 
     @property
-    def digest(self) -> str:
-        """Digest of the codebook, 64 hex digits."""
-        return self.link.codebook.digest
+    def digest(self) -> bytes:
+        """Digest of the codebook, 32 bytes."""
+        return bytes.fromhex(self.link.codebook.digest)
 
     @property
     def chip_rate_hz(self) -> int:

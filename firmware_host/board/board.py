@@ -1,5 +1,6 @@
 """A driver board: program it, start and stop it, read its state."""
 
+import struct
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -221,17 +222,14 @@ class Board:
             RefusedError: The board cannot take a value.
         """
         self._configure(bank)
-        digest = bytes.fromhex(bank.digest)
         if not bank.composed:
             clusters = bank.clusters if bank.format == Format.CLUSTERS else 0
-            request = protocol.ChipsRequest(
-                bank.link.packet.packet_chips, self._hold_count(bank), clusters, digest
-            )
-            self.session.call(request)
+            sizes = (bank.link.packet.packet_chips, self._hold_count(bank), clusters)
+            self.session.call(protocol.ChipsRequest(*sizes, bank.digest))
             return
-        pilots = tuple(map(word_of_chips, bank.link.codebook.pilots))
+        pilots = struct.pack(f"<{CLUSTERS}H", *map(word_of_chips, bank.link.codebook.pilots))
         preamble = (bank.link.packet.preamble_chips, word_of_chips(bank.link.codebook.preamble))
-        self.session.call(protocol.CodebookRequest(*preamble, pilots, digest))
+        self.session.call(protocol.CodebookRequest(*preamble, pilots, bank.digest))
 
     def _hold_count(self, bank: Bank) -> int:
         """Times that the board repeats a chip of the bank; above 1 if these are longer than its longest."""
@@ -284,7 +282,7 @@ class Board:
             "length": len(bank.content),
             "chip_rate_hz": bank.chip_rate_hz * hold,
             "profile": profile_number(bank),
-            "digest": bytes.fromhex(bank.digest),
+            "digest": bank.digest,
         }
         if bank.composed:
             expected |= {"hold": 0, "frames": packet.frames, "pilot_every": packet.pilot_every}
@@ -325,9 +323,8 @@ class Board:
                     f"{self.session.name}: bank {bank} does not hold what was sent; the old one goes on;"
                     " program it again, and if that does not help have the board looked at"
                 )
-            digest = bytes.fromhex(content.digest)
-            commit = protocol.CommitRequest(bank, content.format, content.packets, total, content.crc, digest)
-            self.session.call(commit)
+            sizes = (content.format, content.packets, total, content.crc)
+            self.session.call(protocol.CommitRequest(bank, *sizes, content.digest))
             status = self._wait_until_swapped()
             if verify and not self.is_active_bank(content, status):
                 raise VerifyError(
@@ -377,7 +374,7 @@ class Board:
         bank = 1 if status.active_bank == 0 else 0
         if like.content:
             self.write_missing(bank, like.content)
-        request = protocol.StreamRequest(bank, like.format, bytes.fromhex(like.digest))
+        request = protocol.StreamRequest(bank, like.format, like.digest)
         slots = self.session.call(request).slots
         if ahead >= slots:
             raise ConfigError(
@@ -403,11 +400,11 @@ class Board:
 
     def check_same_air(self, bank: Bank, status: protocol.StatusReply) -> None:
         """Raise IncompatibleError unless the bank has the codebook and chip rate of the active one."""
-        book, rate_hz = status.digest.hex(), status.chip_rate_hz // max(1, status.hold)
-        if (book, rate_hz) != (bank.digest, bank.chip_rate_hz):
+        rate_hz = status.chip_rate_hz // max(1, status.hold)
+        if (status.digest, rate_hz) != (bank.digest, bank.chip_rate_hz):
             raise IncompatibleError(
-                f"{self.session.name}: plays codebook {book[:16]} at {rate_hz} chips per second,"
-                f" this payload's link has {bank.digest[:16]} ({bank.link.codebook.profile}) at"
+                f"{self.session.name}: plays codebook {status.digest.hex()[:16]} at {rate_hz} chips per"
+                f" second, this payload's link has {bank.digest.hex()[:16]} ({bank.link.codebook.profile}) at"
                 f" air.chip_rate_hz = {bank.chip_rate_hz}; give its link with -c or --set, or 'evlcp board"
                 " program' to change it"
             )

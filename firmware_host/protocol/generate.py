@@ -18,13 +18,13 @@ from evlcp_sdk.link.resolve import resolve
 HERE = Path(__file__).parents[1]
 
 _BASES = {
-    "u8": ("B", 1, "uint8_t"),
-    "u16": ("H", 2, "uint16_t"),
-    "u32": ("I", 4, "uint32_t"),
-    "i16": ("h", 2, "int16_t"),
-    "bytes": ("s", 1, "uint8_t"),
+    "u8": (1, "uint8_t"),
+    "u16": (2, "uint16_t"),
+    "u32": (4, "uint32_t"),
+    "i16": (2, "int16_t"),
+    "bytes": (1, "uint8_t"),
 }
-"""Element types: `struct` code, bytes, and C type."""
+"""Element types: bytes, and C type."""
 
 Table = dict[str, Any]
 
@@ -32,14 +32,12 @@ Table = dict[str, Any]
 def _expand_field(table: Table) -> Table:
     """A field of a payload with its derived values for templates; the count of the payload's rest is 0."""
     base, _, number = table["type"].removesuffix("]").partition("[")
-    code, size, c_type = _BASES[base]
+    size, c_type = _BASES[base]
     count = int(number) if number else int(base != "bytes")
-    if base == "bytes":
-        python, absent = f'Annotated[bytes, "{count}s"]' if count else "Rest", f"bytes({count})"
-    elif count == 1:
-        python, absent = base.upper(), "0"
+    if number:
+        python, absent = f'Annotated[bytes, "{size * count}s"]', f"bytes({size * count})"
     else:
-        python, absent = f'Annotated[tuple[int, ...], "{count}{code}"]', f"(0,) * {count}"
+        python, absent = base.upper() if count else "Rest", "0"
     since = table.get("since", 0)
     return table | {
         "base": base,

@@ -66,12 +66,10 @@ class WireMessage:
             value = getattr(self, name)
             if code == "*":
                 rest = value
-            elif isinstance(value, tuple):
-                values += value
-            else:
-                if isinstance(value, bytes) and len(value) != struct.calcsize(code):
-                    raise DatagramError(f"{type(self).__name__}.{name}: {len(value)} bytes")
-                values.append(value)
+                continue
+            if isinstance(value, bytes) and len(value) != struct.calcsize(code):
+                raise DatagramError(f"{type(self).__name__}.{name}: {len(value)} bytes")
+            values.append(value)
         try:
             return self._head_struct(minor).pack(*values) + rest
         except struct.error as fault:
@@ -90,18 +88,8 @@ class WireMessage:
             if len(data) not in {cls._head_struct(minor).size for minor in minors}:
                 raise DatagramError(f"{cls.__name__}: {len(data)} bytes, expected {size}")
             data += bytes(size - len(data))
-        flat = list(cls._head_struct().unpack(data[:size]))
-        values: list[Any] = []
-        for code in cls._struct_codes().values():
-            if code == "*":
-                values.append(bytes(data[size:]))
-            elif code[:-1] and code[-1] != "s":
-                count = int(code[:-1])
-                values.append(tuple(flat[:count]))
-                del flat[:count]
-            else:
-                values.append(flat.pop(0))
-        return cls(*values)
+        rest = [bytes(data[size:])] if cls.is_open_ended() else []
+        return cls(*cls._head_struct().unpack(data[:size]), *rest)
 
 
 class WireRequest(WireMessage, Generic[Reply]):

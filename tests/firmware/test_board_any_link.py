@@ -183,7 +183,7 @@ def test_idle_keeps_to_the_limits(device, board, limit, every):
 
 def test_what_the_firmware_refuses(device, board):
     call, bank = board.session.call, a_bank()
-    digest = bytes.fromhex(bank.digest)
+    digest = bank.digest
     chips = protocol.ChipsRequest(200, 1, 10, digest)
     for name, wrong, nearest in (
         *[("packet_chips", n, near) for n, near in ((0, 1), (40961, 40960), (2**32 - 1, 40960))],

@@ -76,10 +76,9 @@ def payloads(draw):
         elif code.endswith("s"):
             values.append(draw(st.binary(min_size=int(code[:-1]), max_size=int(code[:-1]))))
         else:
-            bits, count = {"B": 8, "H": 16, "I": 32, "h": 16}[code[-1]], int(code[:-1] or 1)
-            low = -(1 << bits - 1) if code[-1] == "h" else 0
-            number = st.integers(low, low + (1 << bits) - 1)
-            values.append(draw(number) if count == 1 else tuple(draw(number) for _ in range(count)))
+            bits = {"B": 8, "H": 16, "I": 32, "h": 16}[code]
+            low = -(1 << bits - 1) if code == "h" else 0
+            values.append(draw(st.integers(low, low + (1 << bits) - 1)))
     return cls(*values)
 
 

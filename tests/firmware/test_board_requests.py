@@ -70,8 +70,8 @@ def wire():
 
 
 def commit_of(bank, number=0):
-    digest = bytes.fromhex(bank.digest)
-    return protocol.CommitRequest(number, bank.format, bank.packets, len(bank.content), bank.crc, digest)
+    sizes = (bank.format, bank.packets, len(bank.content), bank.crc)
+    return protocol.CommitRequest(number, *sizes, bank.digest)
 
 
 def test_the_line_counts_what_it_drops(wire):
@@ -200,11 +200,11 @@ def test_banks_are_held(wire):
 def test_a_foreign_codebook_never_plays(wire):
     wire.fill(0, BANK.content)
     commit = commit_of(BANK)
-    foreign = replace(commit, digest=bytes.fromhex(DIGESTS[protocol.Profile.WH8]))
+    foreign = replace(commit, digest=DIGESTS[protocol.Profile.WH8])
     assert wire.each(foreign, START) == [Status.FOREIGN_CODEBOOK, Status.NOTHING_COMMITTED]
-    pilots = tuple(map(word_of_chips, BANK.link.codebook.pilots))
+    pilots = b"".join(word_of_chips(code).to_bytes(2, "little") for code in BANK.link.codebook.pilots)
     own = protocol.CodebookRequest(26, word_of_chips(BANK.link.codebook.preamble), pilots, commit.digest)
-    others = replace(own, pilots=(pilots[0] ^ 1, *pilots[1:]))
+    others = replace(own, pilots=bytes([pilots[0] ^ 1]) + pilots[1:])
     found = wire.each(own, others, replace(own, digest=bytes(32)), replace(own, preamble_chips=33))
     assert found == [Status.OK, Status.FOREIGN_CODEBOOK, Status.FOREIGN_CODEBOOK, Status.OUT_OF_RANGE]
     # one under its own profile plays its own preamble; its digest vouches for nothing

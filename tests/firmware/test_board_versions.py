@@ -40,7 +40,9 @@ def test_bytes_of_each_message_are_those_of_its_version(table):
     assert message.pack(table["minor"]) == wire
     values = {}
     for name, value in dataclasses.asdict(message).items():
-        values[name] = value.hex() if isinstance(value, bytes) else np.array(value).tolist()
+        is_list = isinstance(table["fields"].get(name), list)
+        value = np.frombuffer(value, "<u2").tolist() if is_list else value
+        values[name] = value.hex() if isinstance(value, bytes) else value
     assert {name: value for name, value in values.items() if name in table["fields"]} == table["fields"]
     # what came later is zero to who does not know it
     later = [value for name, value in values.items() if name not in table["fields"]]
@@ -64,9 +66,7 @@ def every_request(board, bank, update):
         board.set_level(41)
     answers.append((refused.value.status, refused.value.detail))
     spare = 1 - board.status().active_bank
-    answers.append(
-        call(requests.StreamRequest(spare, requests.Format.WORDS, bytes.fromhex(bank.digest))).slots
-    )
+    answers.append(call(requests.StreamRequest(spare, requests.Format.WORDS, bank.digest)).slots)
     push = call(requests.PushRequest(spare, 0, 0, 0, bank.content[:64]))
     state = call(requests.UpdateStatusRequest())
     answers += [

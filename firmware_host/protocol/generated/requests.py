@@ -324,7 +324,7 @@ class CodebookRequest(WireRequest[EmptyReply]):
     """Chips of the preamble, at most 32."""
     preamble: U32
     """Preamble, first chip on air the most significant of preamble_chips bits."""
-    pilots: Annotated[tuple[int, ...], "16H"]
+    pilots: Annotated[bytes, "32s"]
     """Pilot words, first chip on air the most significant bit."""
     digest: Annotated[bytes, "32s"]
     """SHA-256 of the codebook."""
