@@ -5,6 +5,9 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from evlcp_sdk.air.codebook import word_of_chips
 from evlcp_sdk.errors import ConfigError
@@ -81,9 +84,9 @@ class Settings:
         ConfigError: A limit is out of its range.
     """
 
-    level_ma: int | None = None
-    watchdog: Watchdog | None = None
-    watchdog_ms: int = 5_000
+    level_ma: Annotated[int, Field(ge=0, le=65535)] | None = None
+    watchdog: Literal["keep", "idle", "dark"] | None = None
+    watchdog_ms: Annotated[int, Field(ge=100, le=2**32 - 1)] = 5_000
     start: bool = True
     level_limit_ma: int | None = None
     duty_limit: float | None = None
@@ -566,7 +569,7 @@ def provision(
         BoardError: See `Board.set_limits`, `Board.program` and `Board.set_level`.
         ConfigError: The bank does not fit the board.
     """
-    if bank.rest is not None and settings.watchdog == Watchdog.IDLE:
+    if bank.rest is not None and settings.watchdog == "idle":
         raise ConfigError(
             "watchdog = idle: LEDs that are on for a chip of two say something in this link's framing;"
             " use dark, or keep"
@@ -584,9 +587,10 @@ def provision(
         status = board.status()
     level = settings.level_ma
     level_last = level is not None and status.level_ma != level and not _try_level(board, level)
-    wanted = (settings.watchdog, settings.watchdog_ms)
-    if settings.watchdog is not None and (status.watchdog, status.watchdog_ms) != wanted:
-        board.set_watchdog(settings.watchdog, settings.watchdog_ms)
+    if settings.watchdog is not None:
+        wanted = (Watchdog[settings.watchdog.upper()], settings.watchdog_ms)
+        if wanted != (status.watchdog, status.watchdog_ms):
+            board.set_watchdog(*wanted)
     try:
         done = board.program(bank, verify, progress)
     except RefusedError:

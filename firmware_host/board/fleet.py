@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field
 
@@ -25,11 +25,11 @@ from firmware_host.board.symbols import read_symbols
 from firmware_host.emulators.opening import open_port
 from firmware_host.errors import FleetError, IncompatibleError
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.generated.requests import DEFAULT_BAUD, Watchdog
+from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
 
-@dataclass(frozen=True)
-class FleetEntry:
+@dataclass(frozen=True, kw_only=True)
+class FleetEntry(Settings):
     """One board of an inventory: its payload and `Settings`; paths are relative to the inventory's.
 
     Attributes:
@@ -69,16 +69,11 @@ class FleetEntry:
     repeat: Annotated[int, Field(ge=1, le=1000)] = 1
     link: str | dict[str, Any] | None = None
     unique_id: Annotated[str, Field(pattern="^[0-9a-f]{24}$")] | None = None
-    level_ma: Annotated[int, Field(ge=0, le=65535)] | None = None
-    watchdog: Literal["keep", "idle", "dark"] | None = None
-    watchdog_ms: Annotated[int, Field(ge=100, le=2**32 - 1)] = 5_000
-    start: bool = True
     baud: Annotated[int, Field(ge=1200)] = DEFAULT_BAUD
-    level_limit_ma: Annotated[int, Field(ge=1, le=65535)] | None = None
-    duty_limit: Annotated[float, Field(ge=0.001, le=1)] | None = None
     board_key: str | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         given = (self.payload is not None, self.random is not None, self.has_message)
         if sum(given) != 1:
             raise ConfigError("give payload or random or a message (text, beacon), one of them")
@@ -91,14 +86,6 @@ class FleetEntry:
     def has_message(self) -> bool:
         """Whether it sends a message."""
         return self.text is not None or self.beacon is not None
-
-    @property
-    def settings(self) -> Settings:
-        """The board's settings."""
-        watchdog = None if self.watchdog is None else Watchdog[self.watchdog.upper()]
-        return Settings(
-            self.level_ma, watchdog, self.watchdog_ms, self.start, self.level_limit_ma, self.duty_limit
-        )
 
 
 @dataclass(frozen=True)
@@ -263,7 +250,7 @@ def program_fleet(
 
     def work(entry: FleetEntry, board: Board) -> tuple[str, dict[str, Any]]:
         start = time.monotonic()
-        done = provision(board, banks[entry.id], entry.settings, verify)
+        done = provision(board, banks[entry.id], entry, verify)
         table = {"written_bytes": done.written, "swapped": done.swapped}
         if not done.swapped:
             return f"was there already ({done.length} bytes)", table

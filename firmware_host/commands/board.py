@@ -176,11 +176,9 @@ def program(
             _watch_fleet(inventory, entries, 1.0, None, True, as_json, quiet=True)
         return
     from firmware_host.board.board import Settings, provision
-    from firmware_host.protocol.generated.requests import Watchdog
 
-    action = None if watchdog is None else Watchdog[watchdog.upper()]
     bank = payload.load_bank()
-    settings = Settings(level, action, watchdog_ms, start, level_limit, duty_limit)
+    settings = Settings(level, watchdog, watchdog_ms, start, level_limit, duty_limit)
     with open_board(context) as board:
         with progress_bar("programming") as progress:
             done = provision(board, bank, settings, verify, progress)

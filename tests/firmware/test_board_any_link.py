@@ -27,7 +27,7 @@ from firmware_host.board.board import Settings, profile_number, provision
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import IncompatibleError, RefusedError
 from firmware_host.protocol.generated import requests as protocol
-from firmware_host.protocol.generated.requests import BoardFault, Format, Profile, Status, Watchdog
+from firmware_host.protocol.generated.requests import BoardFault, Format, Profile, Status
 
 SIZES = (3, 14, 1, 9, 9, 20, 6, 2, 12, 11)
 LED_CLUSTERS = np.random.default_rng(4).permutation(np.repeat(np.arange(10), SIZES))
@@ -172,7 +172,7 @@ def test_idle_keeps_to_the_limits(device, board, limit, every):
     """LEDs are on for no more of it than they may be, whatever the length of a packet."""
     packet = replace(PacketFormat.of(BOOK, 1), preamble_chips=103)
     bank = Bank.of_chips(np.zeros((151, 10), np.uint8), link_of(BOOK, packet))
-    provision(board, bank, Settings(watchdog=Watchdog.IDLE, watchdog_ms=100, duty_limit=limit))
+    provision(board, bank, Settings(watchdog="idle", watchdog_ms=100, duty_limit=limit))
     device.run(700_000)
     on = np.flatnonzero(shown_chips(device)[:, 0])
     assert (np.diff(on) == every).all()
@@ -355,7 +355,7 @@ def test_what_would_be_characters_is_refused(serial, board):
     link, symbols, _ = serial
     bank = make_bank(symbols[None], link)
     with pytest.raises(ConfigError, match="watchdog = idle: LEDs that are on for a chip of two say"):
-        provision(board, bank, Settings(watchdog=Watchdog.IDLE))
-    provision(board, bank, Settings(watchdog=Watchdog.DARK, duty_limit=0.8, start=False))
+        provision(board, bank, Settings(watchdog="idle"))
+    provision(board, bank, Settings(watchdog="dark", duty_limit=0.8, start=False))
     with pytest.raises(RefusedError, match="a pause of this link has a LED on for 1 of the time, the duty"):
         board.stream(link)

@@ -19,7 +19,7 @@ from firmware_host.protocol.generated.requests import BoardFault, State, StatusR
 
 
 def test_a_host_that_stays_keeps_the_watchdog_still(device, board):
-    done = provision(board, some_bank(2), Settings(watchdog=Watchdog.IDLE, watchdog_ms=300))
+    done = provision(board, some_bank(2), Settings(watchdog="idle", watchdog_ms=300))
     assert (done.watchdog, done.watchdog_ms) == ("idle", 300)
     status = board.status()
     board.wait_with_keep_alive(3.0, status)

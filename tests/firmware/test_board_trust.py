@@ -171,7 +171,7 @@ def test_nor_is_anything_done_twice_in_a_session(device, wraps):
 
 def test_who_has_no_key_does_not_stand_in_for_the_host(device):
     board = lock(device)
-    provision(board, BANK, Settings(watchdog=Watchdog.DARK, watchdog_ms=500))
+    provision(board, BANK, Settings(watchdog="dark", watchdog_ms=500))
     stranger = board_on(device)
     for _ in range(20):
         stranger.status()

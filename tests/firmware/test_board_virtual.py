@@ -132,7 +132,7 @@ def test_save_survives_reset_and_damage(device, board):
     first, second = some_bank(1, 1), some_bank(2, 2, other)
     assert (first.format, second.format) == (protocol.Format.WORDS, protocol.Format.CLUSTERS)
     for bank in (first, second):
-        provision(board, bank, Settings(level_ma=33, watchdog=Watchdog.IDLE, watchdog_ms=700, start=False))
+        provision(board, bank, Settings(level_ma=33, watchdog="idle", watchdog_ms=700, start=False))
         board.save()
     device.reset()
     board = board_on(device)
