@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs, read_json, writing
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.link.compose import encode_messages, make_messages
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.text import to_toml
@@ -205,14 +206,10 @@ def _message_step(text: str, message: Message, symbols: NDArray[np.int64], link:
         "duration_s": duration_s,
     }
     summary = (
-        f'"{text}", {size} bytes: {_count_text(count, "packet")} with error correction, {bits} bits as'
+        f'"{text}", {size} bytes: {format_count(count, "packet")} with error correction, {bits} bits as'
         f" {symbols.size} symbols in {chips} chips, {1e3 * duration_s:.4g} ms"
     )
     return Step("message", summary, figures, ("link.toml", "message.json"))
-
-
-def _count_text(count: int, of: str) -> str:
-    return f"{count} {of}{'s' * (count != 1)}"
 
 
 def _light_step(light: EmulatedLight, link: Link, folder: Path) -> Step:
@@ -223,7 +220,7 @@ def _light_step(light: EmulatedLight, link: Link, folder: Path) -> Step:
     rate_hz, on_share = round(light.rate_hz, 3), round(float(light.chips.mean()), 4)
     figures = {"leds": leds, "chips": chips, "chip_rate_hz": rate_hz, "on_share": on_share}
     summary = (
-        f"{_count_text(leds, 'LED')}, {rate_hz:g} chips a second, on for {on_share:.0%} of the time;"
+        f"{format_count(leds, 'LED')}, {rate_hz:g} chips a second, on for {on_share:.0%} of the time;"
         f" {chips} chips watched, each what the message says"
     )
     return Step("light", summary, figures, ("leds.bin", _CHIPS))

@@ -4,6 +4,7 @@ import os
 import select
 import socket
 import tty
+from contextlib import ExitStack
 from pathlib import Path
 
 from evlcp_sdk.errors import ConfigError
@@ -46,37 +47,34 @@ class HostLine:
         self.place = listen
         self._server: socket.socket | None = None
         self._host: int | None = None
-        self._terminal_ends: list[int] = []
-        self._link: Path | None = link
         self._unsent = b""
+        self._closing = ExitStack()
         try:
             if listen == "pty":
                 self._open_terminal(link)
             else:
                 self._server = self._listen(listen)
         except OSError as fault:
+            self.close()
             raise ToolchainError(f"{listen}: no board can listen there: {fault.strerror or fault}") from fault
 
     def _listen(self, listen: str) -> socket.socket:
         address = socket_address(listen)
         if isinstance(address, tuple):
-            return socket.create_server(address)
-        self._link = Path(address)
-        if self._link.is_socket():
-            self._link.unlink()
-        server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            server.bind(address)
-        except OSError:
-            server.close()
-            raise
+            return self._closing.enter_context(socket.create_server(address))
+        path = Path(address)
+        if path.is_socket():
+            path.unlink()
+        server = self._closing.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+        server.bind(address)
+        self._closing.callback(path.unlink, missing_ok=True)
         server.listen(1)
         return server
 
     def _open_terminal(self, link: Path | None) -> None:
         # The other end stays open, so that the line outlives a host.
         self._host, end = os.openpty()
-        self._terminal_ends = [end]
+        self._closing.callback(os.close, end)
         tty.setraw(end)
         os.set_blocking(self._host, False)
         self.place = os.ttyname(end)
@@ -84,6 +82,7 @@ class HostLine:
             if link.is_symlink():
                 link.unlink()
             link.symlink_to(self.place)
+            self._closing.callback(link.unlink, missing_ok=True)
             self.place = str(link)
 
     def exchange(self, data: bytes, wait_s: float) -> bytes:
@@ -128,12 +127,7 @@ class HostLine:
     def close(self) -> None:
         """Stop listening, and remove the socket or the link."""
         self._hang_up()
-        for end in self._terminal_ends:
-            os.close(end)
-        if self._server is not None:
-            self._server.close()
-        if self._link is not None:
-            self._link.unlink(missing_ok=True)
+        self._closing.close()
 
 
 def _has_left(host: int) -> bool:
