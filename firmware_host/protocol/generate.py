@@ -7,7 +7,6 @@ import argparse
 import sys
 import tomllib
 from collections.abc import Sequence
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +43,6 @@ def _expand_field(table: Table) -> Table:
         "count": count,
         "since": since,
         "size": size * count,
-        "bits": 8 * size,
         "c_type": c_type,
         "python_type": python,
         # its value if an earlier version lacks it
@@ -90,10 +88,6 @@ def _reply_class(message: Table) -> str:
     return f"{_to_camel_case(message['name'])}Reply" if message["reply"] else "EmptyReply"
 
 
-def _with_offsets(fields: list[Table]) -> list[tuple[Table, int]]:
-    return list(zip(fields, accumulate((f["size"] for f in fields), initial=0), strict=False))
-
-
 def _fields_table(message: Table, major: int) -> str:
     rows = []
     for kind in ("request", "reply"):
@@ -118,7 +112,6 @@ _TEMPLATES = Environment(
 _TEMPLATES.filters |= {
     "camel": _to_camel_case,
     "reply_class": _reply_class,
-    "with_offsets": _with_offsets,
     "fields_table": _fields_table,
     "numbers_table": _numbers_table,
 }

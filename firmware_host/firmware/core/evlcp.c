@@ -96,11 +96,18 @@ static enum evlcp_status out_of_range(struct exchange *x, uint32_t nearest)
     return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, &x->detail, nearest);
 }
 
+enum evlcp_status evlcp_answer(struct exchange *x, const void *payload, uint32_t bytes)
+{
+    evlcp_copy(x->out, payload, bytes);
+    x->out_length = bytes;
+    return EVLCP_STATUS_OK;
+}
+
 /* ---- requests ---- */
 
 static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_hello_request request = evlcp_hello_request_get(x->in);
+    const struct evlcp_hello_request request = *(const struct evlcp_hello_request *)x->in;
     if (request.major != EVLCP_PROTOCOL_MAJOR) {
         static const uint8_t version[4] = {EVLCP_PROTOCOL_MAJOR, EVLCP_PROTOCOL_MINOR};
         return evlcp_refuse(EVLCP_STATUS_INCOMPATIBLE, &x->detail, evlcp_get32(version));
@@ -147,8 +154,7 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x)
     }
     evlcp_copy(reply.unique_id, info->unique_id, sizeof reply.unique_id);
     evlcp_copy(reply.hal, info->name, sizeof reply.hal);
-    x->out_length = evlcp_hello_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 static bool is_chip_rate_ok(const struct evlcp_hal_info *info, uint32_t rate_hz)
@@ -172,7 +178,7 @@ static uint32_t nearest_chip_rate(const struct evlcp_hal_info *info, uint32_t ra
 
 static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_configure_request request = evlcp_configure_request_get(x->in);
+    const struct evlcp_configure_request request = *(const struct evlcp_configure_request *)x->in;
     if (!is_chip_rate_ok(&e->info, request.chip_rate_hz))
         return out_of_range(x, nearest_chip_rate(&e->info, request.chip_rate_hz));
     uint32_t most = EVLCP_BANK_BYTES / EVLCP_FRAME_BYTES;
@@ -200,13 +206,12 @@ static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
     const struct evlcp_configure_reply reply = {
         .ticks_per_chip = e->setup.ticks_per_chip,
         .packet_chips = evlcp_packet_chips(&e->setup)};
-    x->out_length = evlcp_configure_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 static enum evlcp_status on_codebook(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_codebook_request request = evlcp_codebook_request_get(x->in);
+    const struct evlcp_codebook_request request = *(const struct evlcp_codebook_request *)x->in;
     if (request.preamble_chips == 0u || request.preamble_chips > 32u)
         return out_of_range(x, 32u);
     if (!evlcp_profile_digest_ok(e->setup.profile, request.digest))
@@ -233,7 +238,7 @@ static enum evlcp_status on_codebook(struct evlcp *e, struct exchange *x)
 
 static enum evlcp_status on_chips(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_chips_request request = evlcp_chips_request_get(x->in);
+    const struct evlcp_chips_request request = *(const struct evlcp_chips_request *)x->in;
     if (request.packet_chips == 0u || request.packet_chips > EVLCP_BANK_BYTES)
         return out_of_range(x, request.packet_chips == 0u ? 1u : EVLCP_BANK_BYTES);
     if (request.hold == 0u || request.clusters > EVLCP_LEDS)
@@ -248,46 +253,44 @@ static enum evlcp_status on_chips(struct evlcp *e, struct exchange *x)
 
 static enum evlcp_status on_write(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_write_request to = evlcp_write_request_get(x->in);
-    uint32_t count = x->in_length - EVLCP_WRITE_REQUEST_BYTES;
+    const struct evlcp_write_request to = *(const struct evlcp_write_request *)x->in;
+    uint32_t count = x->in_length - (uint32_t)sizeof to;
     if (!evlcp_banks_range_ok(to.bank, to.offset, count))
         return out_of_range(x, EVLCP_BANK_BYTES);
     if (evlcp_banks_in_use(&e->banks, to.bank))
         return EVLCP_STATUS_BUSY;
     e->banks.plan[to.bank].valid = false;
-    evlcp_copy(e->banks.content[to.bank] + to.offset, x->in + EVLCP_WRITE_REQUEST_BYTES, count);
+    evlcp_copy(e->banks.content[to.bank] + to.offset, x->in + sizeof to, count);
     const struct evlcp_write_reply reply = {.bank = to.bank, .offset = to.offset, .count = (uint16_t)count};
-    x->out_length = evlcp_write_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 static enum evlcp_status on_read(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_read_request request = evlcp_read_request_get(x->in);
-    if (!evlcp_banks_range_ok(request.bank, request.offset, request.count) ||
-        request.count > EVLCP_MAX_PAYLOAD - EVLCP_READ_REPLY_BYTES)
-        return out_of_range(x, EVLCP_MAX_PAYLOAD - EVLCP_READ_REPLY_BYTES);
-    x->out[0] = request.bank;
-    evlcp_put32(x->out + 1, request.offset);
-    evlcp_copy(x->out + EVLCP_READ_REPLY_BYTES, e->banks.content[request.bank] + request.offset, request.count);
-    x->out_length = EVLCP_READ_REPLY_BYTES + request.count;
+    const struct evlcp_read_request request = *(const struct evlcp_read_request *)x->in;
+    const struct evlcp_read_reply reply = {.bank = request.bank, .offset = request.offset};
+    const uint32_t most = EVLCP_MAX_PAYLOAD - (uint32_t)sizeof reply;
+    if (!evlcp_banks_range_ok(request.bank, request.offset, request.count) || request.count > most)
+        return out_of_range(x, most);
+    evlcp_copy(x->out + sizeof reply, e->banks.content[request.bank] + request.offset, request.count);
+    (void)evlcp_answer(x, &reply, sizeof reply);
+    x->out_length += request.count;
     return EVLCP_STATUS_OK;
 }
 
 static enum evlcp_status on_crc(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_crc_request request = evlcp_crc_request_get(x->in);
+    const struct evlcp_crc_request request = *(const struct evlcp_crc_request *)x->in;
     if (!evlcp_banks_range_ok(request.bank, request.offset, request.length))
         return out_of_range(x, EVLCP_BANK_BYTES);
     const struct evlcp_crc_reply reply = {
         .crc = evlcp_crc32(0u, e->banks.content[request.bank] + request.offset, request.length)};
-    x->out_length = evlcp_crc_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 static enum evlcp_status on_commit(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_commit_request request = evlcp_commit_request_get(x->in);
+    const struct evlcp_commit_request request = *(const struct evlcp_commit_request *)x->in;
     uint8_t active = atomic_load(&e->banks.active);
     uint8_t pending = atomic_load(&e->banks.pending);
     bool held = request.bank < EVLCP_BANKS && evlcp_banks_in_use(&e->banks, request.bank);
@@ -306,13 +309,12 @@ static enum evlcp_status on_commit(struct evlcp *e, struct exchange *x)
     if (!held)
         evlcp_activate(e, request.bank);
     const struct evlcp_commit_reply reply = {.commits = e->banks.commits};
-    x->out_length = evlcp_commit_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 static enum evlcp_status on_stream(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_stream_request request = evlcp_stream_request_get(x->in);
+    const struct evlcp_stream_request request = *(const struct evlcp_stream_request *)x->in;
     uint8_t active = atomic_load(&e->banks.active);
     if (atomic_load(&e->banks.pending) != EVLCP_NO_BANK)
         return EVLCP_STATUS_BUSY;
@@ -323,22 +325,21 @@ static enum evlcp_status on_stream(struct evlcp *e, struct exchange *x)
         return status;
     evlcp_activate(e, request.bank);
     const struct evlcp_stream_reply reply = {.slots = (uint16_t)e->banks.stream[request.bank].slots};
-    x->out_length = evlcp_stream_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 static enum evlcp_status on_push(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_push_request request = evlcp_push_request_get(x->in);
+    const struct evlcp_push_request request = *(const struct evlcp_push_request *)x->in;
     if (request.bank >= EVLCP_BANKS)
         return out_of_range(x, EVLCP_BANKS - 1u);
     struct evlcp_stream *stream = &e->banks.stream[request.bank];
     if (!stream->on)
         return EVLCP_STATUS_NOTHING_COMMITTED;
-    uint32_t count = x->in_length - EVLCP_PUSH_REQUEST_BYTES;
+    uint32_t count = x->in_length - (uint32_t)sizeof request;
     if (count != 0u)
         evlcp_stream_push(stream, e->banks.content[request.bank], request.number, request.offset,
-                          x->in + EVLCP_PUSH_REQUEST_BYTES, count);
+                          x->in + sizeof request, count);
     const struct evlcp_push_reply reply = {.number = atomic_load(&stream->pushed),
                                            .offset = (uint16_t)stream->filled,
                                            .begun = atomic_load(&stream->begun),
@@ -346,8 +347,7 @@ static enum evlcp_status on_push(struct evlcp *e, struct exchange *x)
     /* The end holds once everything before it is there. */
     if (request.last == 1u && reply.offset == 0u && reply.number == request.number + (count != 0u ? 1u : 0u))
         atomic_store(&stream->ended, true);
-    x->out_length = evlcp_push_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
@@ -373,7 +373,7 @@ static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
 
 static enum evlcp_status on_start(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_start_request request = evlcp_start_request_get(x->in);
+    const struct evlcp_start_request request = *(const struct evlcp_start_request *)x->in;
     struct evlcp_pulse pulse;
     bool waits = request.at_pulse != 0u || request.at_clock != 0u;
     if (waits && (e->info.capabilities & EVLCP_CAPABILITY_PULSE) == 0u)
@@ -401,7 +401,7 @@ static enum evlcp_status on_start(struct evlcp *e, struct exchange *x)
 
 static enum evlcp_status on_level(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_level_request request = evlcp_level_request_get(x->in);
+    const struct evlcp_level_request request = *(const struct evlcp_level_request *)x->in;
     if (request.level_ma > e->level_limit_ma)
         return out_of_range(x, e->level_limit_ma);
     uint32_t allowed = evlcp_allowed_duty(e, request.level_ma, e->duty_limit);
@@ -479,13 +479,12 @@ static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
     reply.chip_rate_hz = setup->chip_rate_hz;
     evlcp_copy(reply.digest, setup->digest, sizeof reply.digest);
     evlcp_copy(reply.open_leds, e->health.open_leds, sizeof reply.open_leds);
-    x->out_length = evlcp_status_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 static enum evlcp_status on_watchdog(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_watchdog_request request = evlcp_watchdog_request_get(x->in);
+    const struct evlcp_watchdog_request request = *(const struct evlcp_watchdog_request *)x->in;
     if (request.action > EVLCP_WATCHDOG_DARK)
         return out_of_range(x, EVLCP_WATCHDOG_DARK);
     if (request.action != EVLCP_WATCHDOG_KEEP && request.timeout_ms < WATCHDOG_MIN_MS)
@@ -499,14 +498,12 @@ static enum evlcp_status on_recall(struct evlcp *e, struct exchange *x)
 {
     struct evlcp_recall_reply reply = {0};
     enum evlcp_status status = evlcp_settings_recall(e, false, &reply);
-    if (status == EVLCP_STATUS_OK)
-        x->out_length = evlcp_recall_reply_put(x->out, &reply);
-    return status;
+    return status == EVLCP_STATUS_OK ? evlcp_answer(x, &reply, sizeof reply) : status;
 }
 
 static enum evlcp_status on_led_test(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_led_test_request request = evlcp_led_test_request_get(x->in);
+    const struct evlcp_led_test_request request = *(const struct evlcp_led_test_request *)x->in;
     if (is_running(e) || atomic_load(&e->player.want_play))
         return EVLCP_STATUS_BUSY;
     if (request.last >= EVLCP_LEDS || request.first > request.last)

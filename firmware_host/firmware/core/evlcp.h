@@ -14,7 +14,7 @@
 #define EVLCP_VERSION_PATCH 0u
 
 #define EVLCP_SLOTS 2u
-#define EVLCP_SLOT_BYTES (EVLCP_SAVED_BYTES + EVLCP_BANK_BYTES)
+#define EVLCP_SLOT_BYTES (sizeof(struct evlcp_saved) + EVLCP_BANK_BYTES)
 
 struct evlcp_watch {
     uint8_t action;
@@ -102,6 +102,9 @@ void evlcp_hardware_failed(struct evlcp *e);
 
 /* Everything that is not urgent. */
 void evlcp_poll(struct evlcp *e);
+
+/* Answer a request by a payload, a structure of protocol.h. */
+enum evlcp_status evlcp_answer(struct exchange *x, const void *payload, uint32_t bytes);
 
 /* Requests that are handled beside what they are about: in settings.c and update.c. */
 enum evlcp_status on_save(struct evlcp *e, struct exchange *x);

@@ -7,10 +7,8 @@
 /* False if the slot is empty, torn, or of a board with another tick rate. */
 static bool get_slot(struct evlcp *e, uint8_t index, struct evlcp_saved *s)
 {
-    uint8_t b[EVLCP_SAVED_BYTES];
-    hal_flash_read(index, 0u, b, sizeof b);
-    *s = evlcp_saved_get(b);
-    return s->magic == MAGIC && s->check == evlcp_crc32(0u, b, sizeof b - 4u) && s->chip_rate_hz != 0u &&
+    hal_flash_read(index, 0u, (uint8_t *)s, sizeof *s);
+    return s->magic == MAGIC && s->check == evlcp_crc32(0u, (uint8_t *)s, sizeof *s - 4u) && s->chip_rate_hz != 0u &&
            e->info.tick_hz % s->chip_rate_hz == 0u && s->length <= EVLCP_BANK_BYTES;
 }
 
@@ -24,11 +22,10 @@ static uint8_t newest(struct evlcp *e, struct evlcp_saved found[EVLCP_SLOTS], bo
 
 enum evlcp_status on_save(struct evlcp *e, struct exchange *x)
 {
-    uint8_t autostart = evlcp_get8(x->in);
+    uint8_t autostart = x->in[0];
     uint8_t active = atomic_load(&e->banks.active);
     struct evlcp_saved found[EVLCP_SLOTS];
     bool valid[EVLCP_SLOTS];
-    uint8_t header[EVLCP_SAVED_BYTES];
     if (autostart > 1u)
         return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, &x->detail, 1u);
     /* Erasing stops the processor on single-bank parts: chips would come late, a LED test would stand still. */
@@ -71,21 +68,20 @@ enum evlcp_status on_save(struct evlcp *e, struct exchange *x)
     }
     evlcp_copy(slot.digest, setup->digest, sizeof slot.digest);
     evlcp_copy(slot.key, e->trust.key, sizeof slot.key);
-    (void)evlcp_saved_put(header, &slot);
-    evlcp_put32(header + sizeof header - 4u, evlcp_crc32(0u, header, sizeof header - 4u));
+    const uint8_t *header = (const uint8_t *)&slot;
+    slot.check = evlcp_crc32(0u, header, sizeof slot - 4u);
     /* The header goes last: until it is complete the slot is empty. */
     if (!hal_flash_erase(to) ||
-        !hal_flash_write(to, EVLCP_SAVED_BYTES, e->banks.content[active], slot.length) ||
-        !hal_flash_write(to, 0u, header, sizeof header))
+        !hal_flash_write(to, sizeof(struct evlcp_saved), e->banks.content[active], slot.length) ||
+        !hal_flash_write(to, 0u, header, sizeof slot))
         return EVLCP_STATUS_FLASH_FAULT;
     /* Read back what the flash took. */
     struct evlcp_saved back;
-    if (evlcp_flash_crc(to, EVLCP_SAVED_BYTES, slot.length) != slot.crc || !get_slot(e, to, &back) ||
+    if (evlcp_flash_crc(to, sizeof(struct evlcp_saved), slot.length) != slot.crc || !get_slot(e, to, &back) ||
         back.sequence != sequence)
         return EVLCP_STATUS_FLASH_FAULT;
     const struct evlcp_save_reply reply = {.slot = to, .save_sequence = sequence};
-    x->out_length = evlcp_save_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 /* Load one slot into the spare bank and commit it. */
@@ -113,7 +109,7 @@ static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct evlcp
     evlcp_copy(setup.digest, s->digest, sizeof setup.digest);
     evlcp_copy(request.digest, s->digest, sizeof request.digest);
     e->banks.plan[bank].valid = false;
-    hal_flash_read(index, EVLCP_SAVED_BYTES, e->banks.content[bank], s->length);
+    hal_flash_read(index, sizeof(struct evlcp_saved), e->banks.content[bank], s->length);
     enum evlcp_status status = evlcp_banks_check(&e->banks, &setup, &request, &detail);
     if (status != EVLCP_STATUS_OK)
         return status;

@@ -44,10 +44,8 @@ uint32_t evlcp_flash_crc(uint8_t slot, uint32_t offset, uint32_t length)
 /* Whether a place has a whole image. */
 static bool has_valid_image(uint8_t image, struct evlcp_image_seal *seal)
 {
-    uint8_t b[EVLCP_IMAGE_SEAL_BYTES];
-    hal_flash_read(slot_of(image), SEAL_AT, b, sizeof b);
-    *seal = evlcp_image_seal_get(b);
-    return seal->magic == MAGIC && seal->check == evlcp_crc32(0u, b, sizeof b - 4u) &&
+    hal_flash_read(slot_of(image), SEAL_AT, (uint8_t *)seal, sizeof *seal);
+    return seal->magic == MAGIC && seal->check == evlcp_crc32(0u, (uint8_t *)seal, sizeof *seal - 4u) &&
            seal->length <= EVLCP_IMAGE_BYTES && evlcp_flash_crc(slot_of(image), 0u, seal->length) == seal->crc;
 }
 
@@ -116,17 +114,20 @@ static bool is_on_trial(void)
 
 enum evlcp_status on_update_status(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_update_status_reply reply = {
-        .running = hal_running_image(), .trial = is_on_trial() ? 1u : 0u, .capacity = EVLCP_IMAGE_BYTES};
-    reply.next = (uint8_t)(next_image(&reply.sequence) + 1u);
+    uint32_t newest;
+    uint8_t image = next_image(&newest);
+    struct evlcp_update_status_reply reply = {.running = hal_running_image(),
+                                              .trial = is_on_trial() ? 1u : 0u,
+                                              .next = (uint8_t)(image + 1u),
+                                              .sequence = newest,
+                                              .capacity = EVLCP_IMAGE_BYTES};
     evlcp_copy(reply.target, e->info.target, sizeof reply.target);
-    x->out_length = evlcp_update_status_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 enum evlcp_status on_update_begin(struct evlcp *e, struct exchange *x)
 {
-    const struct evlcp_update_begin_request request = evlcp_update_begin_request_get(x->in);
+    const struct evlcp_update_begin_request request = *(const struct evlcp_update_begin_request *)x->in;
     uint32_t newest;
     uint8_t image = next_image(&newest);
     if (is_on_trial()) /* the image before it must stay until this one has proven itself */
@@ -145,39 +146,36 @@ enum evlcp_status on_update_begin(struct evlcp *e, struct exchange *x)
 enum evlcp_status on_update_write(struct evlcp *e, struct exchange *x)
 {
     const struct evlcp_update *u = &e->update;
-    uint32_t offset = evlcp_get32(x->in);
-    uint32_t count = x->in_length - EVLCP_UPDATE_WRITE_REQUEST_BYTES;
+    const struct evlcp_update_write_request request = *(const struct evlcp_update_write_request *)x->in;
+    uint32_t offset = request.offset, count = x->in_length - (uint32_t)sizeof request;
     if (!u->open)
         return EVLCP_STATUS_NOTHING_COMMITTED;
     if (offset % 4u != 0u || offset > u->length || count > u->length - offset)
         return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, &x->detail, u->length);
-    if (!hal_flash_write(slot_of(u->image), offset, x->in + EVLCP_UPDATE_WRITE_REQUEST_BYTES, count))
+    if (!hal_flash_write(slot_of(u->image), offset, x->in + sizeof request, count))
         return EVLCP_STATUS_FLASH_FAULT;
     const struct evlcp_update_write_reply reply = {.offset = offset, .count = (uint16_t)count};
-    x->out_length = evlcp_update_write_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 enum evlcp_status on_update_commit(struct evlcp *e, struct exchange *x)
 {
     struct evlcp_update *u = &e->update;
-    struct evlcp_update_commit_reply reply;
-    uint8_t b[EVLCP_IMAGE_SEAL_BYTES];
+    uint32_t newest;
     if (!u->open)
         return EVLCP_STATUS_NOTHING_COMMITTED;
     x->detail = evlcp_flash_crc(slot_of(u->image), 0u, u->length);
     if (x->detail != u->crc)
         return EVLCP_STATUS_BAD_CRC;
-    (void)next_image(&reply.sequence);
-    reply.sequence++;
+    (void)next_image(&newest);
     u->open = false;
+    const struct evlcp_update_commit_reply reply = {.sequence = newest + 1u};
     struct evlcp_image_seal seal = {.magic = MAGIC, .sequence = reply.sequence, .length = u->length, .crc = u->crc};
-    (void)evlcp_image_seal_put(b, &seal);
-    evlcp_put32(b + sizeof b - 4u, evlcp_crc32(0u, b, sizeof b - 4u));
-    if (!hal_flash_write(slot_of(u->image), SEAL_AT, b, sizeof b) || !has_valid_image(u->image, &seal))
+    const uint8_t *b = (const uint8_t *)&seal;
+    seal.check = evlcp_crc32(0u, b, sizeof seal - 4u);
+    if (!hal_flash_write(slot_of(u->image), SEAL_AT, b, sizeof seal) || !has_valid_image(u->image, &seal))
         return EVLCP_STATUS_FLASH_FAULT;
-    x->out_length = evlcp_update_commit_reply_put(x->out, &reply);
-    return EVLCP_STATUS_OK;
+    return evlcp_answer(x, &reply, sizeof reply);
 }
 
 enum evlcp_status on_update_restart(struct evlcp *e, struct exchange *x)

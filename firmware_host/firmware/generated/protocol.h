@@ -145,11 +145,6 @@ static inline void evlcp_copy(uint8_t *to, const uint8_t *from, uint32_t n)
         to[i] = from[i];
 }
 
-static inline void evlcp_put8(uint8_t *p, uint8_t v)
-{
-    p[0] = v;
-}
-
 static inline void evlcp_put16(uint8_t *p, uint16_t v)
 {
     p[0] = (uint8_t)v;
@@ -162,11 +157,6 @@ static inline void evlcp_put32(uint8_t *p, uint32_t v)
     evlcp_put16(p + 2, (uint16_t)(v >> 16));
 }
 
-static inline uint8_t evlcp_get8(const uint8_t *p)
-{
-    return p[0];
-}
-
 static inline uint16_t evlcp_get16(const uint8_t *p)
 {
     return (uint16_t)(p[0] | (uint16_t)(p[1] << 8));
@@ -177,26 +167,19 @@ static inline uint32_t evlcp_get32(const uint8_t *p)
     return evlcp_get16(p) | (uint32_t)evlcp_get16(p + 2) << 16;
 }
 
-#define EVLCP_HELLO_REQUEST_BYTES 6u
+/* A payload as it is on the wire: packed and little-endian, as are the processors that this is for. */
+#define EVLCP_PAYLOAD __attribute__((packed, may_alias))
+_Static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "payloads are structures");
+
 /* Open a session and learn the board. Its first two fields never change between versions. */
-struct evlcp_hello_request {
+struct EVLCP_PAYLOAD evlcp_hello_request {
     uint8_t major; /* The host's protocol; another major version is INCOMPATIBLE. */
     uint8_t minor; /* The host's protocol. */
     uint32_t nonce; /* Random; the same nonce keeps the session. */
 };
 
-static inline struct evlcp_hello_request evlcp_hello_request_get(const uint8_t *p)
-{
-    struct evlcp_hello_request m = {0};
-    m.major = evlcp_get8(p + 0);
-    m.minor = evlcp_get8(p + 1);
-    m.nonce = evlcp_get32(p + 2);
-    return m;
-}
-
-#define EVLCP_HELLO_REPLY_BYTES 86u
 /* Answer to hello. */
-struct evlcp_hello_reply {
+struct EVLCP_PAYLOAD evlcp_hello_reply {
     uint8_t major; /* The board's protocol. */
     uint8_t minor; /* The board's protocol: what came later it does not know. */
     uint16_t session; /* Goes into the header of every further request. */
@@ -225,40 +208,8 @@ struct evlcp_hello_reply {
     uint32_t chip_rate_min_hz; /* Slowest chip rate. */
 };
 
-static inline uint32_t evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_reply *m)
-{
-    evlcp_put8(p + 0, m->major);
-    evlcp_put8(p + 1, m->minor);
-    evlcp_put16(p + 2, m->session);
-    evlcp_put8(p + 4, m->version_major);
-    evlcp_put8(p + 5, m->version_minor);
-    evlcp_put8(p + 6, m->version_patch);
-    evlcp_put8(p + 7, m->window);
-    evlcp_put16(p + 8, m->max_payload);
-    evlcp_put8(p + 10, m->banks);
-    evlcp_put32(p + 11, m->bank_bytes);
-    evlcp_put8(p + 15, m->clusters);
-    evlcp_put16(p + 16, m->leds);
-    evlcp_put32(p + 18, m->tick_hz);
-    evlcp_put32(p + 22, m->chip_rate_max_hz);
-    evlcp_put16(p + 26, m->level_max_ma);
-    evlcp_put16(p + 28, m->mean_max_ma);
-    evlcp_put16(p + 30, m->burst_chips);
-    evlcp_put32(p + 32, m->capabilities);
-    evlcp_copy(p + 36, m->unique_id, 12u);
-    evlcp_put32(p + 48, m->uptime_ms);
-    evlcp_copy(p + 52, m->hal, 12u);
-    evlcp_put32(p + 64, m->clock_hz);
-    evlcp_copy(p + 68, m->challenge, 8u);
-    evlcp_copy(p + 76, m->key_name, 4u);
-    evlcp_put16(p + 80, m->formats);
-    evlcp_put32(p + 82, m->chip_rate_min_hz);
-    return 86u;
-}
-
-#define EVLCP_CONFIGURE_REQUEST_BYTES 12u
 /* Set what the next COMMIT plays with, not what plays; and limits of light, which hold at once. */
-struct evlcp_configure_request {
+struct EVLCP_PAYLOAD evlcp_configure_request {
     uint32_t chip_rate_hz; /* Chips per second; must divide the tick rate; not changed while playing. */
     uint8_t profile; /* Info-segment profile. */
     uint16_t frames; /* Frames per packet. */
@@ -267,148 +218,60 @@ struct evlcp_configure_request {
     uint16_t duty_limit; /* Largest share of time that a LED is on from now on, permille; 0: as it is. */
 };
 
-static inline struct evlcp_configure_request evlcp_configure_request_get(const uint8_t *p)
-{
-    struct evlcp_configure_request m = {0};
-    m.chip_rate_hz = evlcp_get32(p + 0);
-    m.profile = evlcp_get8(p + 4);
-    m.frames = evlcp_get16(p + 5);
-    m.pilot_every = evlcp_get8(p + 7);
-    m.level_limit_ma = evlcp_get16(p + 8);
-    m.duty_limit = evlcp_get16(p + 10);
-    return m;
-}
-
-#define EVLCP_CONFIGURE_REPLY_BYTES 8u
 /* Answer to configure. */
-struct evlcp_configure_reply {
+struct EVLCP_PAYLOAD evlcp_configure_reply {
     uint32_t ticks_per_chip; /* Length of a chip in ticks. */
     uint32_t packet_chips; /* Length of a packet in chips. */
 };
 
-static inline uint32_t evlcp_configure_reply_put(uint8_t *p, const struct evlcp_configure_reply *m)
-{
-    evlcp_put32(p + 0, m->ticks_per_chip);
-    evlcp_put32(p + 4, m->packet_chips);
-    return 8u;
-}
-
-#define EVLCP_CODEBOOK_REQUEST_BYTES 69u
 /* Set preamble and pilots for the next COMMIT; those of a built-in profile must be the firmware's own. */
-struct evlcp_codebook_request {
+struct EVLCP_PAYLOAD evlcp_codebook_request {
     uint8_t preamble_chips; /* Chips of the preamble, at most 32. */
     uint32_t preamble; /* Preamble, first chip on air the most significant of preamble_chips bits. */
     uint16_t pilots[16]; /* Pilot words, first chip on air the most significant bit. */
     uint8_t digest[32]; /* SHA-256 of the codebook. */
 };
 
-static inline struct evlcp_codebook_request evlcp_codebook_request_get(const uint8_t *p)
-{
-    struct evlcp_codebook_request m = {0};
-    m.preamble_chips = evlcp_get8(p + 0);
-    m.preamble = evlcp_get32(p + 1);
-    for (uint32_t i = 0; i < 16u; i++)
-        m.pilots[i] = evlcp_get16(p + 5 + 2u * i);
-    evlcp_copy(m.digest, p + 37, 32u);
-    return m;
-}
-
-#define EVLCP_CODEBOOK_REPLY_BYTES 0u
-
-#define EVLCP_WRITE_REQUEST_BYTES 5u
 /* Write into a spare bank; voids what was committed in it. */
-struct evlcp_write_request {
+struct EVLCP_PAYLOAD evlcp_write_request {
     uint8_t bank; /* Bank. */
     uint32_t offset; /* First byte. */
 };
 
-static inline struct evlcp_write_request evlcp_write_request_get(const uint8_t *p)
-{
-    struct evlcp_write_request m = {0};
-    m.bank = evlcp_get8(p + 0);
-    m.offset = evlcp_get32(p + 1);
-    return m;
-}
-
-#define EVLCP_WRITE_REPLY_BYTES 7u
 /* Answer to write. */
-struct evlcp_write_reply {
+struct EVLCP_PAYLOAD evlcp_write_reply {
     uint8_t bank; /* Bank. */
     uint32_t offset; /* First byte. */
     uint16_t count; /* Bytes written. */
 };
 
-static inline uint32_t evlcp_write_reply_put(uint8_t *p, const struct evlcp_write_reply *m)
-{
-    evlcp_put8(p + 0, m->bank);
-    evlcp_put32(p + 1, m->offset);
-    evlcp_put16(p + 5, m->count);
-    return 7u;
-}
-
-#define EVLCP_READ_REQUEST_BYTES 7u
 /* Read from a bank. */
-struct evlcp_read_request {
+struct EVLCP_PAYLOAD evlcp_read_request {
     uint8_t bank; /* Bank. */
     uint32_t offset; /* First byte. */
     uint16_t count; /* Bytes wanted. */
 };
 
-static inline struct evlcp_read_request evlcp_read_request_get(const uint8_t *p)
-{
-    struct evlcp_read_request m = {0};
-    m.bank = evlcp_get8(p + 0);
-    m.offset = evlcp_get32(p + 1);
-    m.count = evlcp_get16(p + 5);
-    return m;
-}
-
-#define EVLCP_READ_REPLY_BYTES 5u
 /* Answer to read. */
-struct evlcp_read_reply {
+struct EVLCP_PAYLOAD evlcp_read_reply {
     uint8_t bank; /* Bank. */
     uint32_t offset; /* First byte. */
 };
 
-static inline uint32_t evlcp_read_reply_put(uint8_t *p, const struct evlcp_read_reply *m)
-{
-    evlcp_put8(p + 0, m->bank);
-    evlcp_put32(p + 1, m->offset);
-    return 5u;
-}
-
-#define EVLCP_CRC_REQUEST_BYTES 9u
 /* CRC-32/ISO-HDLC of a bank's bytes. */
-struct evlcp_crc_request {
+struct EVLCP_PAYLOAD evlcp_crc_request {
     uint8_t bank; /* Bank. */
     uint32_t offset; /* First byte. */
     uint32_t length; /* Bytes. */
 };
 
-static inline struct evlcp_crc_request evlcp_crc_request_get(const uint8_t *p)
-{
-    struct evlcp_crc_request m = {0};
-    m.bank = evlcp_get8(p + 0);
-    m.offset = evlcp_get32(p + 1);
-    m.length = evlcp_get32(p + 5);
-    return m;
-}
-
-#define EVLCP_CRC_REPLY_BYTES 4u
 /* Answer to crc. */
-struct evlcp_crc_reply {
+struct EVLCP_PAYLOAD evlcp_crc_reply {
     uint32_t crc; /* CRC of the bytes. */
 };
 
-static inline uint32_t evlcp_crc_reply_put(uint8_t *p, const struct evlcp_crc_reply *m)
-{
-    evlcp_put32(p + 0, m->crc);
-    return 4u;
-}
-
-#define EVLCP_COMMIT_REQUEST_BYTES 44u
 /* Check a bank; play it from the next packet boundary, or, if the check fails, go on with the old one. */
-struct evlcp_commit_request {
+struct EVLCP_PAYLOAD evlcp_commit_request {
     uint8_t bank; /* Bank. */
     uint8_t format; /* What the bank holds. */
     uint16_t packets; /* Packets in the bank. */
@@ -417,77 +280,25 @@ struct evlcp_commit_request {
     uint8_t digest[32]; /* Digest of the codebook the content was made with. */
 };
 
-static inline struct evlcp_commit_request evlcp_commit_request_get(const uint8_t *p)
-{
-    struct evlcp_commit_request m = {0};
-    m.bank = evlcp_get8(p + 0);
-    m.format = evlcp_get8(p + 1);
-    m.packets = evlcp_get16(p + 2);
-    m.length = evlcp_get32(p + 4);
-    m.crc = evlcp_get32(p + 8);
-    evlcp_copy(m.digest, p + 12, 32u);
-    return m;
-}
-
-#define EVLCP_COMMIT_REPLY_BYTES 4u
 /* Answer to commit. */
-struct evlcp_commit_reply {
+struct EVLCP_PAYLOAD evlcp_commit_reply {
     uint32_t commits; /* Commits accepted since reset. */
 };
 
-static inline uint32_t evlcp_commit_reply_put(uint8_t *p, const struct evlcp_commit_reply *m)
-{
-    evlcp_put32(p + 0, m->commits);
-    return 4u;
-}
-
-#define EVLCP_START_REQUEST_BYTES 10u
 /* Play the active bank from its first packet; nothing happens if it plays. */
-struct evlcp_start_request {
+struct EVLCP_PAYLOAD evlcp_start_request {
     uint32_t at_pulse; /* Begin at this pulse, as STATUS counts them, and keep in step; 0: not. */
     uint16_t pulse_hz; /* Pulses a second; must divide the chip rate. */
     uint32_t at_clock; /* Without a pulse: begin when STATUS's clock stands here; 0: at once. */
 };
 
-static inline struct evlcp_start_request evlcp_start_request_get(const uint8_t *p)
-{
-    struct evlcp_start_request m = {0};
-    m.at_pulse = evlcp_get32(p + 0);
-    m.pulse_hz = evlcp_get16(p + 4);
-    m.at_clock = evlcp_get32(p + 6);
-    return m;
-}
-
-#define EVLCP_START_REPLY_BYTES 0u
-
-#define EVLCP_STOP_REQUEST_BYTES 0u
-
-#define EVLCP_STOP_REPLY_BYTES 0u
-
-#define EVLCP_BLANK_REQUEST_BYTES 0u
-
-#define EVLCP_BLANK_REPLY_BYTES 0u
-
-#define EVLCP_LEVEL_REQUEST_BYTES 2u
 /* Set the LED current; refused above its limit, or if what is committed were too bright. */
-struct evlcp_level_request {
+struct EVLCP_PAYLOAD evlcp_level_request {
     uint16_t level_ma; /* LED current, mA. */
 };
 
-static inline struct evlcp_level_request evlcp_level_request_get(const uint8_t *p)
-{
-    struct evlcp_level_request m = {0};
-    m.level_ma = evlcp_get16(p + 0);
-    return m;
-}
-
-#define EVLCP_LEVEL_REPLY_BYTES 0u
-
-#define EVLCP_STATUS_REQUEST_BYTES 0u
-
-#define EVLCP_STATUS_REPLY_BYTES 149u
 /* Answer to status. */
-struct evlcp_status_reply {
+struct EVLCP_PAYLOAD evlcp_status_reply {
     uint8_t state; /* State. */
     uint16_t faults; /* Fault bits. */
     uint8_t active_bank; /* Bank that plays or would play, or no_bank. */
@@ -529,236 +340,79 @@ struct evlcp_status_reply {
     uint8_t clusters; /* Clusters of the active bank's masks; 0 without these. */
 };
 
-static inline uint32_t evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_reply *m)
-{
-    evlcp_put8(p + 0, m->state);
-    evlcp_put16(p + 1, m->faults);
-    evlcp_put8(p + 3, m->active_bank);
-    evlcp_put8(p + 4, m->pending_bank);
-    evlcp_put8(p + 5, m->format);
-    evlcp_put8(p + 6, m->profile);
-    evlcp_put16(p + 7, m->frames);
-    evlcp_put8(p + 9, m->pilot_every);
-    evlcp_put16(p + 10, m->packets);
-    evlcp_put32(p + 12, m->length);
-    evlcp_put32(p + 16, m->crc);
-    evlcp_put32(p + 20, m->chip_rate_hz);
-    evlcp_put32(p + 24, m->commits);
-    evlcp_put32(p + 28, m->packets_sent);
-    evlcp_put32(p + 32, m->chips_sent);
-    evlcp_put32(p + 36, m->lateness_ticks);
-    evlcp_put32(p + 40, m->lateness_max_ticks);
-    evlcp_put32(p + 44, m->crc_errors);
-    evlcp_put32(p + 48, m->framing_errors);
-    evlcp_put32(p + 52, m->overflow_errors);
-    evlcp_put32(p + 56, m->requests);
-    evlcp_put16(p + 60, m->level_ma);
-    evlcp_put16(p + 62, m->level_limit_ma);
-    evlcp_put16(p + 64, m->duty_limit);
-    evlcp_put16(p + 66, m->duty);
-    evlcp_put16(p + 68, (uint16_t)m->temperature_dc);
-    evlcp_copy(p + 70, m->open_leds, 12u);
-    evlcp_put8(p + 82, m->watchdog);
-    evlcp_put32(p + 83, m->watchdog_ms);
-    evlcp_put32(p + 87, m->silence_ms);
-    evlcp_put32(p + 91, m->uptime_ms);
-    evlcp_copy(p + 95, m->digest, 32u);
-    evlcp_put32(p + 127, m->underruns);
-    evlcp_put32(p + 131, m->clock);
-    evlcp_put32(p + 135, m->pulses);
-    evlcp_put32(p + 139, m->pulse_clocks);
-    evlcp_put32(p + 143, m->packet_chips);
-    evlcp_put8(p + 147, m->hold);
-    evlcp_put8(p + 148, m->clusters);
-    return 149u;
-}
-
-#define EVLCP_WATCHDOG_REQUEST_BYTES 5u
 /* What to do when the host falls silent. */
-struct evlcp_watchdog_request {
+struct EVLCP_PAYLOAD evlcp_watchdog_request {
     uint8_t action; /* Watchdog action. */
     uint32_t timeout_ms; /* Silence before it acts, at least 100 ms. */
 };
 
-static inline struct evlcp_watchdog_request evlcp_watchdog_request_get(const uint8_t *p)
-{
-    struct evlcp_watchdog_request m = {0};
-    m.action = evlcp_get8(p + 0);
-    m.timeout_ms = evlcp_get32(p + 1);
-    return m;
-}
-
-#define EVLCP_WATCHDOG_REPLY_BYTES 0u
-
-#define EVLCP_SAVE_REQUEST_BYTES 1u
 /* Save active bank and settings to the older of two flash slots; only while the LEDs are dark. */
-struct evlcp_save_request {
+struct EVLCP_PAYLOAD evlcp_save_request {
     uint8_t autostart; /* 1: recall and play after a reset. */
 };
 
-static inline struct evlcp_save_request evlcp_save_request_get(const uint8_t *p)
-{
-    struct evlcp_save_request m = {0};
-    m.autostart = evlcp_get8(p + 0);
-    return m;
-}
-
-#define EVLCP_SAVE_REPLY_BYTES 5u
 /* Answer to save. */
-struct evlcp_save_reply {
+struct EVLCP_PAYLOAD evlcp_save_reply {
     uint8_t slot; /* Slot written. */
     uint32_t save_sequence; /* Its sequence number. */
 };
 
-static inline uint32_t evlcp_save_reply_put(uint8_t *p, const struct evlcp_save_reply *m)
-{
-    evlcp_put8(p + 0, m->slot);
-    evlcp_put32(p + 1, m->save_sequence);
-    return 5u;
-}
-
-#define EVLCP_RECALL_REQUEST_BYTES 0u
-
-#define EVLCP_RECALL_REPLY_BYTES 5u
 /* Answer to recall. */
-struct evlcp_recall_reply {
+struct EVLCP_PAYLOAD evlcp_recall_reply {
     uint8_t slot; /* Slot read. */
     uint32_t save_sequence; /* Its sequence number. */
 };
 
-static inline uint32_t evlcp_recall_reply_put(uint8_t *p, const struct evlcp_recall_reply *m)
-{
-    evlcp_put8(p + 0, m->slot);
-    evlcp_put32(p + 1, m->save_sequence);
-    return 5u;
-}
-
-#define EVLCP_LED_TEST_REQUEST_BYTES 4u
 /* Walk over LEDs one by one, at their mean current at most; not while playing. STOP or BLANK ends it. */
-struct evlcp_led_test_request {
+struct EVLCP_PAYLOAD evlcp_led_test_request {
     uint8_t first; /* First LED. */
     uint8_t last; /* Last LED. */
     uint16_t dwell_ms; /* Time a LED is on, at least 1 ms. */
 };
 
-static inline struct evlcp_led_test_request evlcp_led_test_request_get(const uint8_t *p)
-{
-    struct evlcp_led_test_request m = {0};
-    m.first = evlcp_get8(p + 0);
-    m.last = evlcp_get8(p + 1);
-    m.dwell_ms = evlcp_get16(p + 2);
-    return m;
-}
-
-#define EVLCP_LED_TEST_REPLY_BYTES 0u
-
-#define EVLCP_STREAM_REQUEST_BYTES 34u
 /* Make a spare bank an empty queue of packets and play from it; idle pattern while it is empty. */
-struct evlcp_stream_request {
+struct EVLCP_PAYLOAD evlcp_stream_request {
     uint8_t bank; /* Bank. */
     uint8_t format; /* What a packet holds. */
     uint8_t digest[32]; /* Digest of the codebook that packets are made with. */
 };
 
-static inline struct evlcp_stream_request evlcp_stream_request_get(const uint8_t *p)
-{
-    struct evlcp_stream_request m = {0};
-    m.bank = evlcp_get8(p + 0);
-    m.format = evlcp_get8(p + 1);
-    evlcp_copy(m.digest, p + 2, 32u);
-    return m;
-}
-
-#define EVLCP_STREAM_REPLY_BYTES 2u
 /* Answer to stream. */
-struct evlcp_stream_reply {
+struct EVLCP_PAYLOAD evlcp_stream_reply {
     uint16_t slots; /* Packets that the queue holds, the one that plays among them. */
 };
 
-static inline uint32_t evlcp_stream_reply_put(uint8_t *p, const struct evlcp_stream_reply *m)
-{
-    evlcp_put16(p + 0, m->slots);
-    return 2u;
-}
-
-#define EVLCP_PUSH_REQUEST_BYTES 8u
 /* Put a piece of a packet into the queue, if it is the next and there is room; the reply says what is. */
-struct evlcp_push_request {
+struct EVLCP_PAYLOAD evlcp_push_request {
     uint8_t bank; /* Bank. */
     uint32_t number; /* Number of the packet, from 0 on. */
     uint16_t offset; /* First byte. */
     uint8_t last; /* 1: no further packet comes, dark after what is there; 0: playing goes on. */
 };
 
-static inline struct evlcp_push_request evlcp_push_request_get(const uint8_t *p)
-{
-    struct evlcp_push_request m = {0};
-    m.bank = evlcp_get8(p + 0);
-    m.number = evlcp_get32(p + 1);
-    m.offset = evlcp_get16(p + 5);
-    m.last = evlcp_get8(p + 7);
-    return m;
-}
-
-#define EVLCP_PUSH_REPLY_BYTES 14u
 /* Answer to push. */
-struct evlcp_push_reply {
+struct EVLCP_PAYLOAD evlcp_push_reply {
     uint32_t number; /* Number of the packet that is next: those before it are there. */
     uint16_t offset; /* Bytes of it that are there. */
     uint32_t begun; /* Packets that have begun to play. */
     uint32_t underruns; /* How often the queue was empty before its end was announced. */
 };
 
-static inline uint32_t evlcp_push_reply_put(uint8_t *p, const struct evlcp_push_reply *m)
-{
-    evlcp_put32(p + 0, m->number);
-    evlcp_put16(p + 4, m->offset);
-    evlcp_put32(p + 6, m->begun);
-    evlcp_put32(p + 10, m->underruns);
-    return 14u;
-}
-
-#define EVLCP_KEY_REQUEST_BYTES 16u
 /* Set the key that requests which change something are sealed with; SAVE keeps it. */
-struct evlcp_key_request {
+struct EVLCP_PAYLOAD evlcp_key_request {
     uint8_t key[16]; /* The key; zeros for none. */
 };
 
-static inline struct evlcp_key_request evlcp_key_request_get(const uint8_t *p)
-{
-    struct evlcp_key_request m = {0};
-    evlcp_copy(m.key, p + 0, 16u);
-    return m;
-}
-
-#define EVLCP_KEY_REPLY_BYTES 0u
-
-#define EVLCP_CHIPS_REQUEST_BYTES 38u
 /* Set packets of chips alone for the next COMMIT or STREAM, in place of a codebook. */
-struct evlcp_chips_request {
+struct EVLCP_PAYLOAD evlcp_chips_request {
     uint32_t packet_chips; /* Chips of a packet in the bank. */
     uint8_t hold; /* How many chips of the chip rate each of them lasts, from 1 on. */
     uint8_t clusters; /* Clusters of the format CLUSTERS; 0: MASKS only. */
     uint8_t digest[32]; /* SHA-256 of what chips mean, which COMMIT repeats. */
 };
 
-static inline struct evlcp_chips_request evlcp_chips_request_get(const uint8_t *p)
-{
-    struct evlcp_chips_request m = {0};
-    m.packet_chips = evlcp_get32(p + 0);
-    m.hold = evlcp_get8(p + 4);
-    m.clusters = evlcp_get8(p + 5);
-    evlcp_copy(m.digest, p + 6, 32u);
-    return m;
-}
-
-#define EVLCP_CHIPS_REPLY_BYTES 0u
-
-#define EVLCP_UPDATE_STATUS_REQUEST_BYTES 0u
-
-#define EVLCP_UPDATE_STATUS_REPLY_BYTES 27u
 /* Answer to update_status. */
-struct evlcp_update_status_reply {
+struct EVLCP_PAYLOAD evlcp_update_status_reply {
     uint8_t running; /* Image that runs: 0 the one that was flashed, 1 or 2 one that came by an update. */
     uint8_t trial; /* 1: it runs on trial, and is left at the third reset unless it is confirmed. */
     uint8_t next; /* Image that an update takes the place of. */
@@ -767,88 +421,31 @@ struct evlcp_update_status_reply {
     uint8_t target[16]; /* What the board is, ASCII, zero-padded: part and crystal. */
 };
 
-static inline uint32_t evlcp_update_status_reply_put(uint8_t *p, const struct evlcp_update_status_reply *m)
-{
-    evlcp_put8(p + 0, m->running);
-    evlcp_put8(p + 1, m->trial);
-    evlcp_put8(p + 2, m->next);
-    evlcp_put32(p + 3, m->capacity);
-    evlcp_put32(p + 7, m->sequence);
-    evlcp_copy(p + 11, m->target, 16u);
-    return 27u;
-}
-
-#define EVLCP_UPDATE_BEGIN_REQUEST_BYTES 9u
 /* Erase the place of the next image; only while the LEDs are dark, and not on trial. */
-struct evlcp_update_begin_request {
+struct EVLCP_PAYLOAD evlcp_update_begin_request {
     uint8_t image; /* Image, as UPDATE_STATUS says. */
     uint32_t length; /* Its bytes. */
     uint32_t crc; /* Their CRC-32/ISO-HDLC. */
 };
 
-static inline struct evlcp_update_begin_request evlcp_update_begin_request_get(const uint8_t *p)
-{
-    struct evlcp_update_begin_request m = {0};
-    m.image = evlcp_get8(p + 0);
-    m.length = evlcp_get32(p + 1);
-    m.crc = evlcp_get32(p + 5);
-    return m;
-}
-
-#define EVLCP_UPDATE_BEGIN_REPLY_BYTES 0u
-
-#define EVLCP_UPDATE_WRITE_REQUEST_BYTES 4u
 /* Write into the place that was erased. */
-struct evlcp_update_write_request {
+struct EVLCP_PAYLOAD evlcp_update_write_request {
     uint32_t offset; /* First byte, a multiple of four. */
 };
 
-static inline struct evlcp_update_write_request evlcp_update_write_request_get(const uint8_t *p)
-{
-    struct evlcp_update_write_request m = {0};
-    m.offset = evlcp_get32(p + 0);
-    return m;
-}
-
-#define EVLCP_UPDATE_WRITE_REPLY_BYTES 6u
 /* Answer to update_write. */
-struct evlcp_update_write_reply {
+struct EVLCP_PAYLOAD evlcp_update_write_reply {
     uint32_t offset; /* First byte. */
     uint16_t count; /* Bytes written. */
 };
 
-static inline uint32_t evlcp_update_write_reply_put(uint8_t *p, const struct evlcp_update_write_reply *m)
-{
-    evlcp_put32(p + 0, m->offset);
-    evlcp_put16(p + 4, m->count);
-    return 6u;
-}
-
-#define EVLCP_UPDATE_COMMIT_REQUEST_BYTES 0u
-
-#define EVLCP_UPDATE_COMMIT_REPLY_BYTES 4u
 /* Answer to update_commit. */
-struct evlcp_update_commit_reply {
+struct EVLCP_PAYLOAD evlcp_update_commit_reply {
     uint32_t sequence; /* Number of this update. */
 };
 
-static inline uint32_t evlcp_update_commit_reply_put(uint8_t *p, const struct evlcp_update_commit_reply *m)
-{
-    evlcp_put32(p + 0, m->sequence);
-    return 4u;
-}
-
-#define EVLCP_UPDATE_RESTART_REQUEST_BYTES 0u
-
-#define EVLCP_UPDATE_RESTART_REPLY_BYTES 0u
-
-#define EVLCP_UPDATE_CONFIRM_REQUEST_BYTES 0u
-
-#define EVLCP_UPDATE_CONFIRM_REPLY_BYTES 0u
-
-#define EVLCP_SAVED_BYTES 128u
 /* What SAVE writes before a bank's content. Packets of chips alone have no frames; then see `preamble`, `pilots`. */
-struct evlcp_saved {
+struct EVLCP_PAYLOAD evlcp_saved {
     uint32_t magic; /* Names this layout. */
     uint32_t sequence; /* The newest slot has the highest. */
     uint8_t autostart; /* 1: recalled and played after a reset. */
@@ -873,93 +470,14 @@ struct evlcp_saved {
     uint32_t check; /* CRC-32 of the above. */
 };
 
-static inline uint32_t evlcp_saved_put(uint8_t *p, const struct evlcp_saved *m)
-{
-    evlcp_put32(p + 0, m->magic);
-    evlcp_put32(p + 4, m->sequence);
-    evlcp_put8(p + 8, m->autostart);
-    evlcp_put8(p + 9, m->watchdog);
-    evlcp_put16(p + 10, m->level_ma);
-    evlcp_put32(p + 12, m->watchdog_ms);
-    evlcp_put8(p + 16, m->format);
-    evlcp_put8(p + 17, m->profile);
-    evlcp_put8(p + 18, m->preamble_chips);
-    evlcp_put8(p + 19, m->pilot_every);
-    evlcp_put16(p + 20, m->frames);
-    evlcp_put16(p + 22, m->packets);
-    evlcp_put32(p + 24, m->preamble);
-    evlcp_put32(p + 28, m->length);
-    evlcp_put32(p + 32, m->crc);
-    evlcp_put32(p + 36, m->chip_rate_hz);
-    for (uint32_t i = 0; i < 16u; i++)
-        evlcp_put16(p + 40 + 2u * i, m->pilots[i]);
-    evlcp_copy(p + 72, m->digest, 32u);
-    evlcp_put16(p + 104, m->level_limit_ma);
-    evlcp_put16(p + 106, m->duty_limit);
-    evlcp_copy(p + 108, m->key, 16u);
-    evlcp_put32(p + 124, m->check);
-    return 128u;
-}
-
-static inline struct evlcp_saved evlcp_saved_get(const uint8_t *p)
-{
-    struct evlcp_saved m = {0};
-    m.magic = evlcp_get32(p + 0);
-    m.sequence = evlcp_get32(p + 4);
-    m.autostart = evlcp_get8(p + 8);
-    m.watchdog = evlcp_get8(p + 9);
-    m.level_ma = evlcp_get16(p + 10);
-    m.watchdog_ms = evlcp_get32(p + 12);
-    m.format = evlcp_get8(p + 16);
-    m.profile = evlcp_get8(p + 17);
-    m.preamble_chips = evlcp_get8(p + 18);
-    m.pilot_every = evlcp_get8(p + 19);
-    m.frames = evlcp_get16(p + 20);
-    m.packets = evlcp_get16(p + 22);
-    m.preamble = evlcp_get32(p + 24);
-    m.length = evlcp_get32(p + 28);
-    m.crc = evlcp_get32(p + 32);
-    m.chip_rate_hz = evlcp_get32(p + 36);
-    for (uint32_t i = 0; i < 16u; i++)
-        m.pilots[i] = evlcp_get16(p + 40 + 2u * i);
-    evlcp_copy(m.digest, p + 72, 32u);
-    m.level_limit_ma = evlcp_get16(p + 104);
-    m.duty_limit = evlcp_get16(p + 106);
-    evlcp_copy(m.key, p + 108, 16u);
-    m.check = evlcp_get32(p + 124);
-    return m;
-}
-
-#define EVLCP_IMAGE_SEAL_BYTES 20u
 /* What stands behind an image that came by an update. */
-struct evlcp_image_seal {
+struct EVLCP_PAYLOAD evlcp_image_seal {
     uint32_t magic; /* Names this layout. */
     uint32_t sequence; /* Number of the update. */
     uint32_t length; /* Bytes of the image. */
     uint32_t crc; /* Of the image. */
     uint32_t check; /* CRC-32 of the above. */
 };
-
-static inline uint32_t evlcp_image_seal_put(uint8_t *p, const struct evlcp_image_seal *m)
-{
-    evlcp_put32(p + 0, m->magic);
-    evlcp_put32(p + 4, m->sequence);
-    evlcp_put32(p + 8, m->length);
-    evlcp_put32(p + 12, m->crc);
-    evlcp_put32(p + 16, m->check);
-    return 20u;
-}
-
-static inline struct evlcp_image_seal evlcp_image_seal_get(const uint8_t *p)
-{
-    struct evlcp_image_seal m = {0};
-    m.magic = evlcp_get32(p + 0);
-    m.sequence = evlcp_get32(p + 4);
-    m.length = evlcp_get32(p + 8);
-    m.crc = evlcp_get32(p + 12);
-    m.check = evlcp_get32(p + 16);
-    return m;
-}
 
 #define EVLCP_REQUEST_MOST 69u /* longest request, data left out */
 

@@ -29,7 +29,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     if (size == 0u)
         return 0;
     struct native *board = board_new(id);
-    const uint8_t hello[EVLCP_HELLO_REQUEST_BYTES] = {EVLCP_PROTOCOL_MAJOR, EVLCP_PROTOCOL_MINOR, 1u};
+    const uint8_t hello[sizeof(struct evlcp_hello_request)] = {EVLCP_PROTOCOL_MAJOR, EVLCP_PROTOCOL_MINOR, 1u};
     send_datagram(board, 0u, EVLCP_NO_SESSION, EVLCP_TYPE_HELLO, hello, sizeof hello);
     if ((data[0] & 1u) == 0u) {
         for (size_t at = 1; at < size; at += 512u) {
