@@ -73,12 +73,6 @@ def _expand_message(table: Table) -> Table:
 _CLASSES = {"fault": "BoardFault"}
 """Class names that differ from their definition, as the SDK uses that name for something else."""
 
-_NUMBERS = {
-    "protocol": ("header_bytes", "crc_bytes", "max_payload", "window", "default_baud"),
-    "geometry": ("clusters", "leds", "row_bytes"),
-}
-"""Numbers of the definition that become constants of the Python module."""
-
 
 def _to_camel_case(name: str) -> str:
     return _CLASSES.get(name) or "".join(part.capitalize() for part in name.split("_"))
@@ -124,11 +118,9 @@ def render_template(template: str, definition: Table) -> str:
         ValueError: The definition contradicts itself.
     """
     messages = [_expand_message(table) for table in definition["message"]]
-    numbers = [(key.upper(), definition[part][key]) for part, keys in _NUMBERS.items() for key in keys]
     return _TEMPLATES.get_template(f"{template}.j2").render(
         definition,
         messages=messages,
-        numbers=numbers,
         stored=[(t["name"], t["doc"], [_expand_field(f) for f in t["fields"]]) for t in definition["stored"]],
         digests={
             # the firmware is built with these: the default link's with each profile
