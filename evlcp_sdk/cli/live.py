@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -129,22 +128,22 @@ def live(
     with (
         stop_on_request() as stopped,
         _serve(serving, publisher, links, url, plan, clock, out),
-        _show_status(publisher, silent=lines is not None),
     ):
-        summary = run_live(
-            ReconnectingSource(partial(open_source, url), stopped) if reconnect else url,
-            out,
-            links,
-            plan=plan,
-            attitude=attitude,
-            clock_zero=clock,
-            workers=cores,
-            sinks=sinks,
-            lines=lines,
-            publisher=publisher,
-            budget=Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
-            stopped=stopped.or_when(lambda: out is None and lines is not None and lines.closed),
-        )
+        with _show_status(publisher, silent=lines is not None):
+            summary = run_live(
+                ReconnectingSource(partial(open_source, url), stopped) if reconnect else url,
+                out,
+                links,
+                plan=plan,
+                attitude=attitude,
+                clock_zero=clock,
+                workers=cores,
+                sinks=sinks,
+                lines=lines,
+                publisher=publisher,
+                budget=Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
+                stopped=stopped.or_when(lambda: out is None and lines is not None and lines.closed),
+            )
         print_end(summary, out, lines, as_json=result.as_json)
         code = _exit_code(summary, out if stopped() else None)
     raise typer.Exit(code or int(lines is not None and lines.failed))
@@ -211,21 +210,16 @@ def _show_status(publisher: Publisher, *, silent: bool) -> Iterator[None]:
     if silent or not err.is_interactive:
         yield
         return
-    subscription = publisher.subscribe({"status"}, most=1)
+    subscription, text = publisher.subscribe({"status"}, most=1), ""
 
-    def draw() -> None:
-        with Live(console=err, transient=True, auto_refresh=False) as shown:
-            while not subscription.ended:
-                for news in subscription.take(timeout_s=1.0):
-                    shown.update(format_status(news.value), refresh=True)
+    def draw() -> str:
+        nonlocal text
+        for news in subscription.take(0):
+            text = format_status(news.value)
+        return text
 
-    thread = threading.Thread(target=draw, name="evlcp-line", daemon=True)
-    thread.start()
-    try:
+    with Live(console=err, transient=True, get_renderable=draw):
         yield
-    finally:
-        publisher.unsubscribe(subscription)
-        thread.join()
 
 
 def format_status(status: LiveStatus) -> str:
