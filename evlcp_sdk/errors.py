@@ -19,6 +19,8 @@ warns of a broken plugin that is left out.
 """
 
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar
@@ -141,6 +143,17 @@ def describe_plugin_fault(fault: BaseException) -> str:
     last = traceback.extract_tb(fault.__traceback__)[-1]
     line = f"{type(fault).__name__}: {format_safely(str, fault)}".splitlines()[0]
     return f"{line} ({Path(last.filename).name}, line {last.lineno})"
+
+
+@contextmanager
+def blame(who: str) -> Iterator[None]:
+    """Turn what code of a plugin raises within into a `PluginError` that names it; the SDK's errors pass."""
+    try:
+        yield
+    except EvlcpError:
+        raise
+    except (Exception, SystemExit) as fault:
+        raise PluginError(f"{who}: {describe_plugin_fault(fault)}") from fault
 
 
 def fault_message(fault: BaseException) -> str:

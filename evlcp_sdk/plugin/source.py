@@ -2,12 +2,12 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self
 
-from evlcp_sdk.errors import EvlcpError, PluginError, StreamError, describe_plugin_fault
+from evlcp_sdk.errors import PluginError, StreamError, blame
 from evlcp_sdk.values import Events, Triggers
 
 DEFAULT_MAX_EVENTS = 1 << 18
@@ -183,7 +183,7 @@ class EventSource(ABC):
             yield events, triggers
 
     def _take_checked(self, max_events: int) -> tuple[Events, Triggers] | None:
-        with self._wrap_faults():
+        with self._blame():
             piece: object = self.take(max_events)
         if piece is None:
             return None
@@ -195,17 +195,10 @@ class EventSource(ABC):
             raise self._plugin_error(f"gave polarity {events.p.max()}, expected 0 or 1")
         return events, triggers
 
-    @contextmanager
-    def _wrap_faults(self) -> Iterator[None]:
-        """Turn a fault of a plugin's source into a `PluginError`; one of the SDK's own passes."""
-        try:
-            yield
-        except EvlcpError:
-            raise
-        except (Exception, SystemExit) as fault:
-            if type(self).__module__.startswith("evlcp_sdk."):
-                raise
-            raise self._plugin_error(describe_plugin_fault(fault)) from fault
+    def _blame(self) -> AbstractContextManager[None]:
+        """`blame` for a plugin's source; what is raised in one of the SDK's own passes."""
+        is_own = type(self).__module__.startswith("evlcp_sdk.")
+        return nullcontext() if is_own else blame(f"{self.path}: source {type(self).__name__}")
 
     def _plugin_error(self, what: str) -> PluginError:
         return PluginError(f"{self.path}: source {type(self).__name__}: {what}")
@@ -226,5 +219,5 @@ class EventSource(ABC):
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         # An earlier error matters more than a failure to close after it.
-        with nullcontext() if error is None else suppress(PluginError), self._wrap_faults():
+        with nullcontext() if error is None else suppress(PluginError), self._blame():
             self.close()

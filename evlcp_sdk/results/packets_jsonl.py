@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
-from evlcp_sdk.errors import PluginError
+from evlcp_sdk.errors import PluginError, blame
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.columns import list_symbols
 from evlcp_sdk.results.folder import ResultFolder
@@ -96,11 +96,9 @@ def message_line(received: ReceivedMessage) -> str:
         "age_s": None if received.age_s is None else round(received.age_s, 6),
     }
     subject = f"message kind '{kind.name}'"
-    try:
+    with blame(f"{subject}: to_dict() fails"):
         content = dict(kind.to_dict(received.value))
         text = json.dumps(line | content, ensure_ascii=False)
-    except (Exception, SystemExit) as fault:
-        raise PluginError(f"{subject}: to_dict() fails: {type(fault).__name__}: {fault}") from fault
     if duplicates := line.keys() & content.keys():
         raise PluginError(f"{subject}: to_dict() shows '{min(duplicates)}', which every message has")
     return text

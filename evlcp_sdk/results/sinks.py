@@ -1,13 +1,12 @@
 """All sinks of one run as one, with the name of the one that fails."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-from evlcp_sdk.errors import EvlcpError, PluginError, describe_plugin_fault
+from evlcp_sdk.errors import PluginError, blame
 from evlcp_sdk.files import writing
 from evlcp_sdk.plugin.records import InstalledSink
 from evlcp_sdk.results.folder import ResultFolder
@@ -51,7 +50,7 @@ class Sinks:
         """
         self._folder = folder.folder
         for installed, cls in classes:
-            with self._blame(installed):
+            with blame(str(installed)), writing(self._folder):
                 self._sinks.append((installed, cls(folder, run)))
 
     @property
@@ -62,14 +61,14 @@ class Sinks:
     def call(self, method: str, *arguments: Any) -> None:
         """Call a method of each sink."""
         for installed, sink in self._sinks:
-            with self._blame(installed):
+            with blame(str(installed)), writing(self._folder):
                 getattr(sink, method)(*arguments)
 
     def finish(self) -> dict[str, Mapping[str, Any]]:
         """Finish the sinks; return their parts of the summary, by name."""
         parts: dict[str, Mapping[str, Any]] = {}
         for installed, sink in self._sinks:
-            with self._blame(installed):
+            with blame(str(installed)), writing(self._folder):
                 part: object = sink.finish()
                 if part is not None and not isinstance(part, Mapping):
                     raise PluginError(f"{installed}: finish() gave {type(part).__name__}, expected a mapping")
@@ -82,15 +81,5 @@ class Sinks:
     def conclude(self, summary: Mapping[str, Any]) -> None:
         """Pass on the summary, to each a copy, so that none can change `summary.json`."""
         for installed, sink in self._sinks:
-            with self._blame(installed):
+            with blame(str(installed)), writing(self._folder):
                 sink.conclude(deepcopy(dict(summary)))
-
-    @contextmanager
-    def _blame(self, installed: InstalledSink) -> Iterator[None]:
-        try:
-            with writing(self._folder):
-                yield
-        except EvlcpError:
-            raise
-        except (Exception, SystemExit) as fault:
-            raise PluginError(f"{installed}: {describe_plugin_fault(fault)}") from fault

@@ -9,7 +9,7 @@ from itertools import count
 from typing import Any, ClassVar
 
 from evlcp_sdk.clock import CameraClock, TimeStep
-from evlcp_sdk.errors import EvlcpError, PluginError, describe_plugin_fault
+from evlcp_sdk.errors import blame
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.reflections import ReflectionQueue
@@ -85,13 +85,8 @@ class Announcer:
     def _call_hook(self, stage: str, value: object, elapsed_s: float) -> None:
         if self._hook is None:
             return
-        try:
+        with blame("evlcp_stage_finished() of a plugin"):
             self._hook(stage=stage, value=to_camera_time(value, self._camera_us), elapsed_s=elapsed_s)
-        except EvlcpError:
-            raise
-        except (Exception, SystemExit) as fault:
-            text = describe_plugin_fault(fault)
-            raise PluginError(f"evlcp_stage_finished() of a plugin: {text}") from fault
 
 
 @dataclass(frozen=True)
