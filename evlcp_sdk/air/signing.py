@@ -9,14 +9,13 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
 from evlcp_sdk.air.blocks import Kind, Message
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError, InputError, import_extra
 from evlcp_sdk.files import read_secret, write_secret
 
 if TYPE_CHECKING:
@@ -33,8 +32,7 @@ _SIGNED_HEAD = struct.Struct("<II4s")
 
 
 def _require_cryptography() -> None:
-    if find_spec("cryptography") is None:
-        raise ConfigError("signed beacons need the extra: pip install 'evlcp-sdk[sign]'")
+    import_extra("cryptography", "sign", "signed beacons")
 
 
 def make_key(path: Path) -> str:

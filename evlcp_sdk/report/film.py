@@ -4,7 +4,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError, InputError, import_extra
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
@@ -118,8 +117,8 @@ def check_film(out: Path, for_ms: float, slow: float) -> FilmKind:
     """
     if (kind := FILM_KINDS.get(out.suffix.lower())) is None:
         raise ConfigError(f"{out}: a film is written as {' or '.join(f'NAME{end}' for end in FILM_KINDS)}")
-    if kind == "MP4" and find_spec("av") is None:
-        raise ConfigError("films as .mp4 need the extra: pip install 'evlcp-sdk[mp4]'")
+    if kind == "MP4":
+        import_extra("av", "mp4", str(out))
     if (pictures := count_pictures(for_ms, slow)) > MAX_PICTURES:
         raise ConfigError(
             f"{for_ms:g} ms at 1/{slow:g} would be {pictures} pictures, at most {MAX_PICTURES}: show less,"

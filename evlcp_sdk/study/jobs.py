@@ -14,11 +14,10 @@ from collections.abc import Callable, Generator, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from threading import Thread
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, explain_fault
+from evlcp_sdk.errors import ConfigError, EvlcpError, explain_fault, import_extra
 
 if TYPE_CHECKING:
     from concurrent.futures import Future, ProcessPoolExecutor
@@ -129,12 +128,7 @@ class DaskCluster:
     """
 
     def __init__(self, address: str) -> None:
-        try:
-            distributed: Any = import_module("distributed")
-        except ImportError as fault:
-            raise ConfigError(
-                "--dask needs the extra: pip install 'evlcp-sdk[cluster]', or leave --dask out"
-            ) from fault
+        distributed = import_extra("distributed", "cluster", "--dask")
         self._address = address
         self._died: type[Exception] = distributed.scheduler.KilledWorker
         try:
