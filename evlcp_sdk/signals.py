@@ -107,12 +107,3 @@ def stop_on_request(pass_on: Callable[[], None] = lambda: None) -> Iterator[EndR
 def waiting(stopped: Stopped) -> AbstractContextManager[None]:
     """`EndRequest.waiting` where `stopped` is one; else nothing."""
     return stopped.waiting() if isinstance(stopped, EndRequest) else nullcontext()
-
-
-def interrupt(_number: int, _frame: FrameType | None) -> None:
-    """Do what Python does at Ctrl-C.
-
-    Raises:
-        KeyboardInterrupt: Always.
-    """
-    raise KeyboardInterrupt

@@ -14,12 +14,10 @@ from evlcp_sdk.formatting import escape_controls
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from contextlib import AbstractContextManager
 
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
 
-    from evlcp_sdk.run import Advance
     from evlcp_sdk.study.jobs import Executor
 
 LinkFile = Annotated[
@@ -107,24 +105,23 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
     Raises:
         ConfigError: The cluster cannot be reached.
     """
+    from evlcp_sdk.study.jobs import DaskCluster, Inline, Processes
+
     if dask is not None:
         if workers is not None:
             raise typer.BadParameter("give one of --workers and --dask", param_hint="--dask")
-        from evlcp_sdk.study.jobs import DaskCluster
-
         return DaskCluster(dask)
     if workers == 0:
-        from evlcp_sdk.study.jobs import Inline
-
         return Inline()
-    from evlcp_sdk.study.jobs import Processes
-
     return Processes(workers or os.cpu_count() or 1)
 
 
 @contextmanager
 def progress_bar(name: str, *, by_bytes: bool = False) -> "Iterator[Callable[..., None]]":
-    """A bar on stderr, on a terminal only; gives a function of the amount done, the total, and a text."""
+    """A bar on stderr, on a terminal only; gives a function of the amount done, the total, and a text.
+
+    Where the total is unknown, it shows the time alone.
+    """
     forced = os.environ.get("FORCE_COLOR") or os.environ.get("TTY_COMPATIBLE")
     # Rich, which would know, loads slowly.
     if not forced and not (sys.stderr is not None and sys.stderr.isatty()):
@@ -143,8 +140,3 @@ def progress_bar(name: str, *, by_bytes: bool = False) -> "Iterator[Callable[...
         yield lambda done, total, words="": bar.update(
             task, completed=done, total=total, description=f"{name} {words}".rstrip()
         )
-
-
-def bytes_bar(name: str) -> "AbstractContextManager[Advance]":
-    """A bar by bytes read, or by time where the size is unknown."""
-    return progress_bar(name, by_bytes=True)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, echo, make_executor
+from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo, make_executor, progress_bar
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.errors import ConfigError, OutputError
@@ -146,7 +146,7 @@ def _compare_recordings(
 def _compare_recording(url: str, *, variants: tuple[Variant, ...], in_process: bool) -> Table:
     from evlcp_sdk.study.compare import compare_recording
 
-    with bytes_bar(Path(url).name) if in_process else nullcontext() as advance:
+    with progress_bar(Path(url).name, by_bytes=True) if in_process else nullcontext() as advance:
         return compare_recording(url, variants, advance=advance or (lambda _done, _of: None))
 
 

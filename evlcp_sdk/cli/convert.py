@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, bytes_bar, echo, print_json
+from evlcp_sdk.cli._common import Json, echo, print_json, progress_bar
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.formatting import format_count
 
@@ -48,7 +48,7 @@ def convert(
             sensor_size = parse_size(size)
         except ValueError as fault:
             raise typer.BadParameter(f"{size!r}: expected {fault}", param_hint="--size") from fault
-    with stop_on_request() as stopped, bytes_bar(Path(url).name) as advance:
+    with stop_on_request() as stopped, progress_bar(Path(url).name, by_bytes=True) as advance:
         result = run_convert(url, out, size=sensor_size, format=format, advance=advance, stopped=stopped)
     if as_json:
         print_json({"out": str(out)} | result)

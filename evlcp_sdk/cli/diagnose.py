@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, bytes_bar, console, print_json
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, print_json, progress_bar
 from evlcp_sdk.cli._tables import print_table
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def diagnose(
     from evlcp_sdk.link.resolve import load_link
 
     link = load_link(link_file, overrides or [])
-    with bytes_bar(Path(recording).name) as advance:
+    with progress_bar(Path(recording).name, by_bytes=True) as advance:
         diagnosis = run(recording, link, advance=advance)
     if out is not None:
         from evlcp_sdk.report.diagnosis_page import render_diagnosis

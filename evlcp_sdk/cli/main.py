@@ -38,12 +38,12 @@ def main() -> None:
 
     sys.unraisablehook = unraisable
     try:
-        from signal import SIGHUP, SIGTERM
+        from signal import SIGHUP, SIGTERM, default_int_handler
 
-        from evlcp_sdk.signals import handle_signals, interrupt
+        from evlcp_sdk.signals import handle_signals
 
-        # Python itself handles Ctrl-C.
-        with handle_signals(interrupt, SIGTERM, SIGHUP):
+        # Python itself handles Ctrl-C; these do the same.
+        with handle_signals(default_int_handler, SIGTERM, SIGHUP):
             from evlcp_sdk.cli._app import run
 
             run()

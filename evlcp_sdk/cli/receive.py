@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import Dask, bytes_bar, make_executor, print_json, progress_bar, silence_matplotlib
+from evlcp_sdk.cli._common import Dask, make_executor, print_json, progress_bar, silence_matplotlib
 from evlcp_sdk.cli._receiving import (
     CameraOptions,
     Cores,
@@ -208,7 +208,7 @@ def _decode(
     run = partial(receive_to_folder, job.url, job.folder, job.link or links, clock_zero=clock(), **options)
     if stopped is not None:
         stop = stopped.or_when(lambda: job.folder is None and lines is not None and lines.closed)
-        with bytes_bar(_source_name(job.url)) as advance:
+        with progress_bar(_source_name(job.url), by_bytes=True) as advance:
             return run(lines=lines, advance=advance, stopped=stop)
     silence_matplotlib()
     # A terminal sends Ctrl-C to workers, too.

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, print_json
+from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, print_json, progress_bar
 from evlcp_sdk.formatting import format_count
 
 From = Annotated[
@@ -57,7 +57,7 @@ def video(
     from evlcp_sdk.run import film
 
     links = load_links(link_files, overrides or [])
-    with bytes_bar(Path(recording).name) as advance:
+    with progress_bar(Path(recording).name, by_bytes=True) as advance:
         summary = film(
             recording,
             out,
