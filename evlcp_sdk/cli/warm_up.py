@@ -13,21 +13,20 @@ def warm_up(as_json: Json = False) -> None:
 
     In an image, before workers start:  [bold]evlcp warm-up[/]
     """
-    from dataclasses import asdict
-
     from evlcp_sdk.formatting import format_count
     from evlcp_sdk.warming import STEPS, warm_up as warm
 
     with progress_bar("compiling") as advance:
         result = warm(lambda step: advance(STEPS.index(step), len(STEPS)))
     if as_json:
-        print_json(asdict(result) | {"kept_in": result.kept_in and str(result.kept_in)})
+        print_json(result)
         return
-    if not result.compiled:
-        console().print(f"nothing to compile; tried in {result.elapsed_s:.1f} s")
+    compiled, elapsed_s = result["compiled"], result["elapsed_s"]
+    if not compiled:
+        console().print(f"nothing to compile; tried in {elapsed_s:.1f} s")
         return
-    console().print(f"{format_count(result.compiled, 'kernel')} compiled in {result.elapsed_s:.0f} s")
-    if result.kept_in is None:
+    console().print(f"{format_count(compiled, 'kernel')} compiled in {elapsed_s:.0f} s")
+    if result["kept_in"] is None:
         console().print(
             "they cannot be kept, so each process compiles them again: give it a home, or a folder by"
             " NUMBA_CACHE_DIR",
