@@ -178,19 +178,16 @@ def run() -> None:
     from evlcp_sdk.errors import PluginWarning
 
     show_other = warnings.showwarning
-    shown = set()
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
         if issubclass(category, PluginWarning):
-            # Every registry of the process repeats it.
-            if str(message) not in shown:
-                print_stderr(f"warning: {message}")
-            shown.add(str(message))
+            print_stderr(f"warning: {message}")
         else:
             show_other(message, category, *place, **more)
 
     with warnings.catch_warnings(), log_on_stderr():
-        warnings.simplefilter("always", PluginWarning)
+        # Once: every registry of the process repeats it.
+        warnings.simplefilter("default", PluginWarning)
         warnings.showwarning = show
         silence_matplotlib()
         module = "".join(sys.argv[1:2]).replace("-", "_")
