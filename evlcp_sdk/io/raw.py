@@ -7,8 +7,9 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from io import RawIOBase
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
@@ -39,18 +40,10 @@ RESERVED_LEAST = 16
 TIMELESS_BYTES = 1 << 24
 
 
-class ByteReader(Protocol):
-    """What a `RawSource` reads from: a file, a pipe, a socket; without `fileno` it is read as a pipe."""
-
-    def readinto(self, room: memoryview, /) -> int | None:
-        """Wait for bytes, write them to the front of `room`, and return how many; 0 at the end."""
-
-    def close(self) -> None:
-        """Release the file."""
-
-
 class ChunkReader(ABC):
-    """A `ByteReader` of bytes that come in chunks, after those that are `ready`.
+    """A raw file, as `io` has them, of bytes that come in chunks, after those that are `ready`.
+
+    Without `fileno` it is read as a pipe.
 
     Attributes:
         bytes_read: Bytes that have been read.
@@ -69,7 +62,7 @@ class ChunkReader(ABC):
         """Release the file; what is read then is empty."""
 
     def readinto(self, room: memoryview, /) -> int:
-        """As `ByteReader.readinto`."""
+        """Wait for bytes, write them to the front of `room`, and return how many; 0 at the end."""
         if not len(self._ready):
             self._ready = memoryview(self.read_chunk())
         size = min(len(room), len(self._ready))
@@ -205,14 +198,14 @@ class RawSource(EventSource):
 
     _gives_bits = True
 
-    def __init__(self, path: Path | str, file: ByteReader | None = None) -> None:
+    def __init__(self, path: Path | str, file: RawIOBase | ChunkReader | None = None) -> None:
         self.path = Path(path)
         self._buffer = np.empty(2 * _kernels.LOOKAHEAD_BYTES, np.uint8)
         self._position = 0  # byte offset in the file of the first byte not decoded
         self._start = self._end = 0  # the bytes of the buffer not decoded
         self._exhausted = False
         try:
-            self._file: ByteReader = self.path.open("rb", buffering=0) if file is None else file
+            self._file = self.path.open("rb", buffering=0) if file is None else file
             self._descriptor: int | None = getattr(self._file, "fileno", lambda: None)()
             status = None if self._descriptor is None else os.fstat(self._descriptor)
         except OSError as error:
