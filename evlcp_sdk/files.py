@@ -481,14 +481,6 @@ def check_rising(path: Path | str, lines: Sequence[int], name: str, values: "NDA
             )
 
 
-def path_exists(path: Path | str) -> bool:
-    """Whether a file or folder of that name exists; false for what cannot be a name."""
-    try:
-        return Path(path).exists()
-    except OSError:
-        return False
-
-
 MAX_BYTES = 1 << 28
 """Larger files are not read whole."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -80,7 +81,6 @@ def _list_presets(*, as_json: bool) -> None:
 
 
 def _choose_source(scene_file: str | None, preset: str | None) -> Path | str:
-    from evlcp_sdk.files import path_exists
     from evlcp_sdk.sim import preset_names, preset_text
 
     if (scene_file is None) == (preset is None):
@@ -89,7 +89,7 @@ def _choose_source(scene_file: str | None, preset: str | None) -> Path | str:
         preset_text(preset)  # raises if there is none
         return preset
     assert scene_file is not None
-    if scene_file in preset_names() and not path_exists(scene_file):
+    if scene_file in preset_names() and not os.path.lexists(scene_file):
         raise typer.BadParameter(
             f"{scene_file}: no such file; for the preset: --preset {scene_file}", param_hint="scene.toml"
         )

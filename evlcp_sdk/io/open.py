@@ -2,6 +2,7 @@
 
 import io
 import math
+import os
 import re
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import unquote
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
-from evlcp_sdk.files import Outputs, path_exists
+from evlcp_sdk.files import Outputs
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
 from evlcp_sdk.io.streams import SCHEMES, open_stream
@@ -44,7 +45,7 @@ _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 def _find_scheme(url: str) -> str:
     """Return the scheme before the `:` of a name, empty for a file or no scheme."""
     found = _SCHEME.match(url)
-    return "" if found is None or path_exists(url) else found[1].lower()
+    return "" if found is None or os.path.lexists(url) else found[1].lower()
 
 
 def is_recording(url: Path | str) -> bool:

@@ -6,6 +6,7 @@ number is an engineering guess, its description says so.
 """
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -19,7 +20,6 @@ import numpy as np
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import path_exists
 from evlcp_sdk.formatting import format_count, suggest
 from evlcp_sdk.link.resolve import Link, load_led_file, resolve
 from evlcp_sdk.plugin.registry import Registry
@@ -504,7 +504,7 @@ def load_scene(
         path = Path(source)
         folder = path.parent
         where = name
-        if not path_exists(path) and not path.suffix:
+        if not os.path.lexists(path) and not path.suffix:
             raise ConfigError(
                 f"{name}: no such file, and no preset of that name{suggest(name, preset_names())}"
             )

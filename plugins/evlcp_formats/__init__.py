@@ -1,12 +1,12 @@
 """The formats that few use: bags, HDF5, MAT, AEDAT4, DAT, ES; Parquet, KML, MCAP."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.files import path_exists
 from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ _SUFFIXES = {".aedat4": "faery", ".aedat": "faery", ".dat": "faery", ".es": "fae
 def evlcp_open_events(url: str) -> "EventSource | None":
     """Open a file of one of these formats by its first bytes or its suffix, or by a scheme as `bag:`."""
     scheme, colon, rest = url.partition(":")
-    if not colon or path_exists(url):
+    if not colon or os.path.lexists(url):
         return _open_as(url, _detect_format(url))
     scheme = scheme.lower()
     if scheme in ("bag", "hdf5"):
