@@ -87,7 +87,7 @@ class SocketTransport(Transport):
     def __init__(self, name: str, connected: socket.socket) -> None:
         self.name = name
         self._socket = connected
-        self._socket.setblocking(False)
+        self._socket.settimeout(None)
 
     @classmethod
     def connect(cls, spec: str) -> "SocketTransport":
@@ -134,11 +134,8 @@ class SocketTransport(Transport):
     def write(self, data: bytes) -> None:
         """See `Transport.write`."""
         try:
-            while data:
-                select.select([], [self._socket], [], 1.0)
-                with contextlib.suppress(BlockingIOError):
-                    data = data[self._socket.send(data) :]
-        except (OSError, ValueError) as fault:
+            self._socket.sendall(data)
+        except OSError as fault:
             raise LineError(f"{self.name}: the line broke: {fault}; run the command again") from fault
 
     def close(self) -> None:
