@@ -1,4 +1,4 @@
-"""Compiled loops over grid cells and over the times of events, and Cholesky's root of a few unknowns."""
+"""Compiled loops over grid cells, pixels and the times of events, and Cholesky's root of a few unknowns."""
 
 from typing import Any
 
@@ -160,6 +160,34 @@ def median(values: Array, n: int) -> float:
         for i in range(1, middle):
             below = max(below, some[i])
     return float((below + some[middle]) / 2)
+
+
+@njit
+def pair_values(first: Array, second: Array, out: Array) -> None:
+    """Values of pairs of polarity sums, `out` int8 (n,): the second's sign, else the opposite of the first's.
+
+    Long loops over flat arrays run on many pixels at once; those over a bar's few columns do not.
+    """
+    for j in range(out.size):
+        a, b = first[j], second[j]
+        up = np.int8(b > 0) - np.int8(b < 0)
+        down = np.int8(a < 0) - np.int8(a > 0)
+        out[j] = up + down * np.int8(b == 0)
+
+
+@njit
+def correlate_code(code: Array, values: Array, begin: int, out: Array) -> None:
+    """Agreement of values (n, pixels), from `begin` on, with a code (n,), `out` int16: alike less unlike."""
+    for j in range(out.size):
+        out[j] = 0
+    for i in range(code.size):
+        value = values[i, begin:]
+        if code[i] > 0:
+            for j in range(out.size):
+                out[j] = np.int16(out[j] + value[j])
+        elif code[i] < 0:
+            for j in range(out.size):
+                out[j] = np.int16(out[j] - value[j])
 
 
 @njit

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk._kernels import invert_matrix, median
+from evlcp_sdk._kernels import correlate_code, invert_matrix, median, pair_values
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -797,14 +797,10 @@ def measure_pilot_light(
     length = codes.shape[1]
     _, height, width = sums.shape
     flat = np.ascontiguousarray(sums).reshape(len(sums), height * width)
-    values = np.empty((length, height * width), np.int8)
+    values, agree = np.empty((length, height * width), np.int8), np.empty(height * width, np.int16)
+    alone = np.zeros(height * width, np.int16)
     for i in range(length):
-        first, second, pairs = flat[every * i], flat[every * i + 1], np.int8(every > 1)
-        for j in range(first.size):
-            a, b = first[j], second[j]
-            up, down = np.int8(b > 0) - np.int8(b < 0), np.int8(a < 0) - np.int8(a > 0)
-            values[i, j] = up + down * np.int8(b == 0) * pairs
-    agree = np.empty(height * width, np.int16)
+        pair_values(flat[every * i] if every > 1 else alone, flat[every * i + 1], values[i])
     for k in range(clusters):
         edges = 0
         for i in range(length):
@@ -814,14 +810,7 @@ def measure_pilot_light(
             out[k] = 0.0
             continue
         begin, end = top * grid * width, bottom * grid * width
-        total_of = agree[begin:end]
-        for j in range(total_of.size):
-            total_of[j] = 0
-        for i in range(length):
-            if codes[k, i] != 0:
-                value, sign = values[i, begin:end], np.int8(codes[k, i])
-                for j in range(total_of.size):
-                    total_of[j] = np.int16(total_of[j] + np.int8(value[j] * sign))
+        correlate_code(codes[k], values, begin, agree[begin:end])
         total, place = 0.0, 0.0
         for r in range(top, bottom):
             for c in range(columns):

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk._kernels import correlate_code, pair_values
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -14,34 +15,6 @@ _STEP_PX = 0.3
 
 _PLACE_PX = 1.0
 """Prior sigma of the bar's distance from its place."""
-
-
-@njit
-def _pair_values(first: Array, second: Array, out: Array) -> None:
-    """Values of pairs of polarity sums, `out` int8 (n,): the second's sign, else the opposite of the first's.
-
-    Long loops over flat arrays run on many pixels at once; those over a bar's few columns do not.
-    """
-    for j in range(out.size):
-        a, b = first[j], second[j]
-        up = np.int8(b > 0) - np.int8(b < 0)
-        down = np.int8(a < 0) - np.int8(a > 0)
-        out[j] = up + down * np.int8(b == 0)
-
-
-@njit
-def _correlate_code(code: Array, values: Array, begin: int, out: Array) -> None:
-    """Agreement of values (n, pixels), from `begin` on, with a code (n,), `out` int16: alike less unlike."""
-    for j in range(out.size):
-        out[j] = 0
-    for i in range(code.size):
-        value = values[i, begin:]
-        if code[i] > 0:
-            for j in range(out.size):
-                out[j] = np.int16(out[j] + value[j])
-        else:
-            for j in range(out.size):
-                out[j] = np.int16(out[j] - value[j])
 
 
 @njit
@@ -78,7 +51,7 @@ def estimate_presence(
                     for j in range(most):
                         total[j] = np.int16(total[j] + other[j])
                 part = total
-        _pair_values(square[1, 0], square[1, 1], by_pixel)
+        pair_values(square[1, 0], square[1, 1], by_pixel)
         for r in range(rows):
             for c in range(columns):
                 j = r * columns + c
@@ -98,7 +71,7 @@ def estimate_presence(
     for j in range(m):
         best[j] = -length
     for k in range(clusters):
-        _correlate_code(codes[k], some, begin, fits[k])
+        correlate_code(codes[k], some, begin, fits[k])
         for j in range(m):
             best[j] = max(best[j], fits[k, j])
     norm = np.empty(m)
@@ -126,7 +99,7 @@ def map_pixels(
     flat = sums.reshape(-1, height * width)
     values, fit = np.empty((length, height * width), np.int8), np.empty(height * width, np.int16)
     for i in range(length):
-        _pair_values(flat[2 * i], flat[2 * i + 1], values[i])
+        pair_values(flat[2 * i], flat[2 * i + 1], values[i])
     near = np.empty((rows, columns), np.bool_)
     for k in range(clusters):
         top, bottom = rows, 0
@@ -140,7 +113,7 @@ def map_pixels(
         if top >= bottom:
             continue
         begin, end = top * grid * width, bottom * grid * width
-        _correlate_code(codes[k], values, begin, fit[: end - begin])
+        correlate_code(codes[k], values, begin, fit[: end - begin])
         near[top:bottom] = False
         for r in range(top, bottom):
             for c in range(columns):
