@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.rx.boxes import mask_inside
+from evlcp_sdk.rx.boxes import box_of, grow_box, mask_inside
 from evlcp_sdk.values import Events, Region
 
 LEVELS: Final = (
@@ -24,6 +24,9 @@ RANGING_EVERY: Final = 4
 
 _MARGIN_PX: Final = 16
 """Around a region, which moves, and may be smaller than its bar."""
+
+_WIDEST_PX: Final = 1 << 16
+"""Columns of any sensor."""
 
 _SEARCH_PERIOD_US: Final = 100_000
 _SEARCH_US: Final = 20_000
@@ -67,14 +70,13 @@ class Budget:
 
 
 class Shedder:
-    """Leaves events of a sensor of this size out by the level of shedding.
+    """Leaves events out by the level of shedding.
 
     Attributes:
         counts: Events left out: of `rows_outside_regions`, of `empty_areas`, and `too_late`.
     """
 
-    def __init__(self, width: int, height: int) -> None:
-        self._size = width, height
+    def __init__(self) -> None:
         self.counts = {"rows_outside_regions": 0, "empty_areas": 0, "too_late": 0}
 
     def shed(self, events: Events, level: int, regions: Sequence[Region]) -> Events:
@@ -86,17 +88,10 @@ class Shedder:
             return events
         kept = np.zeros(len(events), np.bool_)
         for region in regions:
-            left, right = _extend(region.x_px, region.width_px, self._size[0])
-            top, bottom = _extend(region.y_px, region.height_px, self._size[1])
+            left, top, right, bottom = grow_box(box_of(region), _MARGIN_PX)
             kept |= mask_inside(
-                events, (0, top, self._size[0], bottom) if rows_only else (left, top, right, bottom)
+                events, (0, top, _WIDEST_PX, bottom) if rows_only else (left, top, right, bottom)
             )
         name = "rows_outside_regions" if rows_only else "empty_areas"
         self.counts[name] += len(events) - int(np.count_nonzero(kept))
         return events[kept]
-
-
-def _extend(centre_px: float, size_px: float, limit: int) -> tuple[int, int]:
-    """First row or column of a region with its margin, and the one after its last."""
-    first, last = centre_px - size_px / 2 - _MARGIN_PX, centre_px + size_px / 2 + _MARGIN_PX + 1
-    return min(max(int(first), 0), limit), min(max(int(last), 0), limit)

@@ -95,7 +95,7 @@ class LiveLoop:
         self._budget = Budget() if budget is None else budget
         self._reader = Reader(source)
         self._size = source.width or 1280, source.height or 720
-        self._shedder = Shedder(*self._size)
+        self._shedder = Shedder()
         self.delays = {stage: DelayTally() for stage in (*STAGES, _END_TO_END_STAGE)}
         self._recent = {stage: DelayTally() for stage in self.delays}
         self._level = 0

@@ -111,7 +111,7 @@ def test_a_picture_shows_what_each_pixel_did() -> None:
 def test_what_is_shed_and_counted_is_what_lies_outside() -> None:
     events = events_at(np.arange(50_000, 54_000))
     regions = [Region(0, 0.0, 100.0, 200.0, 20.0, 60.0), Region(1, 0.0, 1270.0, 700.0, 20.0, 60.0)]
-    shedder = Shedder(1280, 720)
+    shedder = Shedder()
     assert shedder.shed(events, 0, regions) is events
     assert shedder.shed(events, 4, []) is events
     rows, inside = set(), np.zeros(len(events), bool)
