@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.air.codebook import longest_run
+
 Floats = NDArray[np.floating[Any]]
 
 LIMIT_HZ = 3000.0
@@ -94,7 +96,7 @@ def measure_flicker(chips: NDArray[np.uint8], chip_rate_hz: float) -> list[Clust
         ClusterFlicker(
             cluster=k,
             on_share=float(share[k]),
-            longest_run=_longest_run(chips[:, k]),
+            longest_run=longest_run(chips[:, k]),
             line_hz=float(line_hz[w]),
             line_percent=float(percent[w, k]),
             limit_percent=float(bound[w]),
@@ -103,10 +105,3 @@ def measure_flicker(chips: NDArray[np.uint8], chip_rate_hz: float) -> list[Clust
         )
         for k, w in enumerate(worst)
     ]
-
-
-def _longest_run(chips: NDArray[np.uint8]) -> int:
-    edges = np.flatnonzero(chips != np.roll(chips, 1))
-    if not edges.size:
-        return len(chips)
-    return int(np.diff(np.append(edges, edges[0] + len(chips))).max())

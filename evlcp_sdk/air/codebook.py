@@ -115,6 +115,17 @@ def edges_of_chips(chips: ArrayLike) -> Values:
     return edges
 
 
+def longest_run(chips: ArrayLike) -> int:
+    """Longest run of equal chips (n,) that are sent again and again; all where none differs.
+
+    >>> longest_run([1, 0, 0, 1, 1])
+    3
+    """
+    c = np.asarray(chips)
+    edges = np.flatnonzero(c != np.roll(c, 1))
+    return int(np.diff(edges, append=edges[0] + len(c)).max()) if len(edges) else len(c)
+
+
 def word_of_chips(chips: ArrayLike) -> int:
     """Chips of one code as an integer whose most significant bit goes on air first.
 

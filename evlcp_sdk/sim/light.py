@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.blocks import HEADER_BYTES, Kind, Message
+from evlcp_sdk.air.codebook import longest_run
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import read_npy
@@ -138,7 +139,7 @@ class BarLight:
         if bar.chips_file is not None:
             self._chips = _read_chips(Path(bar.chips_file), link.codebook.clusters)
             self.packet_chips = len(self._chips)
-            self.longest_us *= _longest_run(self._chips)
+            self.longest_us *= max(map(longest_run, self._chips.T))
         else:
             try:
                 if bar.payload != "symbols":
@@ -332,16 +333,6 @@ def _read_chips(path: Path, clusters: int) -> NDArray[np.uint8]:
             f"{path}: {chips.dtype} {chips.shape}, expected 0 and 1 in an array (chips, {clusters} clusters)"
         )
     return chips.astype(np.uint8)
-
-
-def _longest_run(chips: NDArray[np.uint8]) -> int:
-    """Return the longest run of equal chips of any cluster when the chips are repeated."""
-    twice = np.concatenate([chips, chips])
-    longest = 1
-    for cluster in twice.T:
-        cuts = np.flatnonzero(np.diff(cluster)) + 1
-        longest = max(longest, int(np.diff(np.concatenate([[0], cuts, [len(twice)]])).max()))
-    return longest
 
 
 def make_lamp_source(lamp: LampSpec) -> Source:
