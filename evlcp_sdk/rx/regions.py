@@ -32,7 +32,7 @@ from evlcp_sdk.rx.boxes import (
 )
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.rhythm import OPENING_REPEATS, BlinkDetector
-from evlcp_sdk.rx.sweeps import FAST_PX_US, SampledEvents, Sweep, find_sweeps, fit_sweep
+from evlcp_sdk.rx.sweeps import FAST_PX_US, Sweep, find_sweeps, fit_sweep
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
@@ -835,7 +835,7 @@ class RhythmTracker(RegionTracker):
         along_px_us = region.velocity_px_us[1 if upright else 0]
         if gap_us > 0:
             along_px_us = (last.y_px - before.y_px if upright else last.x_px - before.x_px) / gap_us
-        sweep = fit_sweep(SampledEvents.of(region.pieces[-1][1], middle_us), box, along_px_us, FAST_PX_US)
+        sweep = fit_sweep(region.pieces[-1][1], middle_us, box, along_px_us, FAST_PX_US)
         return sweep if sweep is not None and sweep.is_fast else None
 
     def _search_box(self, x_px: float, y_px: float, width_px: float, height_px: float) -> Box:

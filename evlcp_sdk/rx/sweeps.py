@@ -74,42 +74,25 @@ class Sweep(NamedTuple):
         return abs(self.velocity_px_us[0 if self.height_px > self.width_px else 1]) >= FAST_PX_US
 
 
-class SampledEvents(NamedTuple):
-    """Some of a step's events.
-
-    Attributes:
-        columns: Times from the middle of the step, us, columns and rows, float64 (3, n).
-        every: Events that each stands for.
-    """
-
-    columns: NDArray[np.float64]
-    every: int
-
-    @classmethod
-    def of(cls, events: Events, middle_us: float) -> "SampledEvents":
-        """Sample the events of a step evenly."""
-        every = max(events.t_us.size // _MAX_EVENTS, 1)
-        columns = np.array([events.t_us[::every], events.x[::every], events.y[::every]], np.float64)
-        columns[0] -= middle_us
-        return cls(columns, every)
-
-
 def fit_sweep(
-    sample: SampledEvents, box: Box, along_px_us: float = 0.0, least_px_us: float = 0.0
+    events: Events, middle_us: float, box: Box, along_px_us: float = 0.0, least_px_us: float = 0.0
 ) -> Sweep | None:
     """Fit a moving line to the events in a box; None where they lie on none, or on a slow one.
 
     Args:
-        sample: Of a step.
+        events: Those of a step.
+        middle_us: The middle of the step, us.
         box: Where to search.
         along_px_us: Speed along the line, which its events do not show.
         least_px_us: Speed across the line, half of which it must have.
     """
-    left, top, right, bottom = box
-    _, x, y = sample.columns
-    t, x, y = sample.columns[:, (x >= left) & (x < right) & (y >= top) & (y < bottom)]
-    if t.size < _MIN_SAMPLES or t.size * sample.every < _MIN_EVENTS:
+    every = max(events.t_us.size // _MAX_EVENTS, 1)
+    some = events[::every]
+    some = some[mask_inside(some, box)]
+    t, x, y = np.array([some.t_us, some.x, some.y], np.float64)
+    if t.size < _MIN_SAMPLES or t.size * every < _MIN_EVENTS:
         return None
+    t -= middle_us
     across, along = x - x.mean(), y - y.mean()
     upright = float(along @ along) >= float(across @ across)
     across, along = (x, y - along_px_us * t) if upright else (y, x - along_px_us * t)
@@ -131,6 +114,7 @@ def fit_sweep(
     middle = (first + last) / 2
     place = float(plane[0] + plane[2] * (middle - centre))
     width, length = 4 * sigma + abs(float(plane[2])) * (last - first), last - first + 1
+    _, top, _, bottom = box
     y_still = y[near] - (along_px_us if upright else across_px_us) * t[near]
     rows = np.bincount(
         np.clip(np.rint(y_still - top), 0, bottom - top - 1).astype(np.int64), minlength=bottom - top
@@ -173,12 +157,12 @@ def find_sweeps(
     counts = np.bincount(cells, minlength=rows * columns).reshape(rows, columns).astype(np.int16)
     counts[counts < _CELL_EVENTS] = 0
     areas, _ = find_areas(counts, _MAX_AREAS, size_px, _CELL_SHIFT)
-    sweeps, sample = [], SampledEvents.of(events, start_us + step_us / 2)
+    sweeps = []
     for area in areas:
         box = grow_box(area, 1 << _CELL_SHIFT)
         if any(boxes_overlap(area, other) for other in known):
             continue
-        sweep = fit_sweep(sample, box, least_px_us=FAST_PX_US)
+        sweep = fit_sweep(events, start_us + step_us / 2, box, least_px_us=FAST_PX_US)
         if sweep is None or not sweep.is_fast:
             continue
         if chip_us is None or has_chip_rhythm(events, box, chip_us):

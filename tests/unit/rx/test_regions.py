@@ -12,7 +12,7 @@ from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.boxes import cut_neighbours, subtract_boxes
 from evlcp_sdk.rx.regions import BarPlace, RegionTrack, RhythmTracker
 from evlcp_sdk.rx.rhythm import BlinkDetector
-from evlcp_sdk.rx.sweeps import SampledEvents, find_sweeps, fit_sweep, has_chip_rhythm
+from evlcp_sdk.rx.sweeps import find_sweeps, fit_sweep, has_chip_rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import ideal_events, merge_events, random_symbols
 from evlcp_sdk.values import Events
@@ -281,7 +281,7 @@ BOX = 480, 180, 720, 420
 @pytest.mark.parametrize("speed", [0.0, 0.0025, -0.008])
 def test_place_and_speed_of_a_line(speed, along, slope, upright):
     events = line(speed, along=along, slope=slope, upright=upright)
-    found = fit_sweep(SampledEvents.of(events, 30_000 + SWEEP_US / 2), BOX, along)
+    found = fit_sweep(events, 30_000 + SWEEP_US / 2, BOX, along)
     x, y, width, height, moves, rows = found
     assert (x, y) == (pytest.approx(600, abs=1.5), pytest.approx(300, abs=1.5))
     across, length = (width, height) if upright else (height, width)
@@ -297,9 +297,9 @@ def test_place_and_speed_of_a_line(speed, along, slope, upright):
 
 
 def test_what_lies_on_no_line_is_no_sweep():
-    assert fit_sweep(SampledEvents.of(line(0.005, noise=0.6), 30_750), BOX) is None
-    assert fit_sweep(SampledEvents.of(line(0.005, many=150), 30_750), BOX) is None
-    assert fit_sweep(SampledEvents.of(line(0.005), 30_750), (0, 0, 100, 100)) is None
+    assert fit_sweep(line(0.005, noise=0.6), 30_750, BOX) is None
+    assert fit_sweep(line(0.005, many=150), 30_750, BOX) is None
+    assert fit_sweep(line(0.005), 30_750, (0, 0, 100, 100)) is None
 
 
 def test_only_what_comes_with_the_chips_is_a_bar():
