@@ -725,6 +725,16 @@ _V = TypeVar("_V")
 _S = TypeVar("_S", bound=np.generic)
 
 
+def find_quantile_bin(counts: Mapping[int, int], share: float) -> int | None:
+    """The first bin of a histogram up to which it holds a share of its counts; None where it is empty."""
+    seen, enough = 0, share * sum(counts.values())
+    for bin in sorted(counts):
+        seen += counts[bin]
+        if seen >= enough:
+            return bin
+    return None
+
+
 def replace_fields(value: _V, **fields: Any) -> _V:
     """As `dataclasses.replace`, five times as fast; for classes without checks and slots."""
     copy = object.__new__(type(value))

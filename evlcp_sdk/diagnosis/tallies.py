@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.formatting import round_or_none
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage, sigmas
+from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage, find_quantile_bin, sigmas
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import EstimatedBias, Navigator, Placed
@@ -177,12 +177,8 @@ class TransmitterTally:
 
     def median_m(self) -> float:
         """Median distance to the centimetre, m; NaN without any."""
-        seen = 0
-        for cell in sorted(self.distance_cells):
-            seen += self.distance_cells[cell]
-            if 2 * seen >= self.ranged_frames:
-                return round(cell * _CELL_M, 2)
-        return math.nan
+        cell = find_quantile_bin(self.distance_cells, 0.5)
+        return math.nan if cell is None else round(cell * _CELL_M, 2)
 
     @property
     def symbols_given(self) -> int:

@@ -5,6 +5,7 @@ from collections import Counter
 from typing import Final
 
 from evlcp_sdk.formatting import round_or_none
+from evlcp_sdk.values import find_quantile_bin
 
 _RANGE_MS: Final = (1e-3, 1e6)
 _CELLS_PER_E: Final = 50
@@ -34,14 +35,8 @@ class DelayTally:
 
     def quantile_ms(self, share: float) -> float:
         """The delay that this share of all does not exceed, ms, to 2 %; NaN where there is none."""
-        if not self.count:
-            return math.nan
-        left = math.ceil(share * self.count)
-        for cell in sorted(self._cells):
-            left -= self._cells[cell]
-            if left <= 0:
-                break
-        return min(math.exp(cell / _CELLS_PER_E), self.max_ms)
+        cell = find_quantile_bin(self._cells, share)
+        return math.nan if cell is None else min(math.exp(cell / _CELLS_PER_E), self.max_ms)
 
     def to_dict(self) -> dict[str, float | int | None]:
         """Count, p50, p99 and maximum, ms, as JSON values."""

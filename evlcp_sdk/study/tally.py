@@ -9,6 +9,7 @@ from typing import Annotated, Any, Self, overload
 from pydantic import Field
 
 from evlcp_sdk.specs import build_spec
+from evlcp_sdk.values import find_quantile_bin
 
 SEGMENT_M = 10
 """Length of the segments of distance that figures are given for, m."""
@@ -330,12 +331,8 @@ class Tally:
         >>> (Tally.of_fix(0.02, 1) + Tally.of_fix(0.9, 1)).position_quantile_m(0.5)
         0.025
         """
-        seen = 0
-        for bin, count in self.position_histogram.items():
-            seen += count
-            if seen >= share * self.fixes:
-                return (bin + 1) * POSITION_BIN_M
-        return math.nan
+        bin = find_quantile_bin(self.position_histogram, share)
+        return math.nan if bin is None else (bin + 1) * POSITION_BIN_M
 
 
 def _nees_micro(nees: float) -> int:

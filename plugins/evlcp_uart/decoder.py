@@ -295,9 +295,7 @@ def _find_bunch_spacing(counts: NDArray[np.int32]) -> int:
     if not near.any() or (many * many).sum() < _BUNCH_EVENTS * many.sum():
         return 1
     weights = np.minimum(many[:-1], many[1:])[near]
-    order = np.argsort(gaps[near], kind="stable")
-    half = np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)
-    return int(gaps[near][order][half])
+    return int(np.quantile(gaps[near], 0.5, weights=weights, method="inverted_cdf"))
 
 
 def _spread_events(counts: NDArray[np.int32], ticks: int) -> NDArray[np.int32]:
