@@ -53,6 +53,10 @@ def imu_sigmas(motion: ImuMotion, spec: ErrorModel) -> Floats:
     return np.array(sigmas)
 
 
+_LEVEL = [0, 1, 3, 4]
+"""Rows of east and north among those of place and speed."""
+
+
 def dead_reckon(
     motion: ImuMotion,
     velocity_m_s: Floats,
@@ -77,50 +81,43 @@ def dead_reckon(
     if motion.has_gyro:
         angle = angle - bias[0] * t_s
     rotation, path = np.exp(-1j * angle), _integrate_turn(t_s, angle)
-    acceleration_m_s2 = None
+    displacement, noise, by_bias = np.zeros(6), np.zeros((6, 6)), np.zeros((6, len(sigmas)))
+    level = np.ix_(_LEVEL, _LEVEL)
     if motion.acceleration_m_s2 is None:
-        velocity = complex(velocity_m_s[0], velocity_m_s[1])
         remaining = path[-1] - path
-        by_angle = -1j * velocity * np.stack([remaining, np.full_like(remaining, rotation[-1])])
-        kicks = np.stack([remaining, np.full_like(remaining, rotation[-1])]) / rotation
-        power = spec.acceleration_m2_s3
-        factors = complex(path[-1]), complex(rotation[-1])
-        displacement = np.zeros(6)
+        moves = np.stack([remaining, np.full_like(remaining, rotation[-1])])
+        by_turn = _by_level(-1j * complex(*velocity_m_s[:2]) * moves)[:, 0]
+        kicks, power, by_speed = moves / rotation, spec.acceleration_m2_s3, moves[:, 0]
     else:
-        acceleration_m_s2 = motion.acceleration_m_s2 - bias[-3:]
-        right, forward, up = (np.interp(t_s, motion.t_s, one) for one in acceleration_m_s2.T)
+        right, forward, up = (np.interp(t_s, motion.t_s, a) for a in (motion.acceleration_m_s2 - bias[-3:]).T)
         facing = np.exp(-1j * heading_rad)
         speed = _integrate(t_s, facing * rotation * (right + 1j * forward))
-        place = _integrate(t_s, speed)
-        by_angle = -1j * np.stack([place[-1] - place - speed * (dt_s - t_s), speed[-1] - speed])
-        kicks = np.stack([dt_s - t_s, np.ones_like(t_s)]).astype(np.complex128)
-        power = spec.accelerometer_white_m2_s3
-        factors = complex(dt_s), complex(1.0)
-        climb = _integrate(t_s, up)
-        rise = _integrate(t_s, climb)
-        move, change = place[-1], speed[-1]
-        displacement = np.array([move.real, move.imag, rise[-1], change.real, change.imag, climb[-1]])
+        place, climb = _integrate(t_s, speed), _integrate(t_s, up)
+        turned = np.stack([place[-1] - place - speed * (dt_s - t_s), speed[-1] - speed])
+        by_turn = _by_level(-1j * turned)[:, 0]
+        kicks, power = np.stack([dt_s - t_s, np.ones_like(t_s)]), spec.accelerometer_white_m2_s3
+        by_speed = kicks[:, 0]
+        displacement[_LEVEL] = _by_level(np.array([place[-1], speed[-1]]))[:, 0]
+        displacement[[2, 5]] = _integrate(t_s, climb)[-1], climb[-1]
+        by_bias[_LEVEL, -3:-1] = -sigmas[-1] * _by_level(facing * np.array([path @ weight, path[-1]]))
+        by_bias[[2, 5], -1] = -sigmas[-1] * dt_s**2 / 2, -sigmas[-1] * dt_s
+        noise[level] = heading_sigma_rad**2 * np.outer(by_turn[:, 0], by_turn[:, 0])
     transition = np.eye(6)
-    transition[:2, 3:5], transition[3:5, 3:5] = _complex_matrix(factors[0]), _complex_matrix(factors[1])
+    transition[_LEVEL, 3:5] = _by_level(by_speed)
     transition[2, 5] = dt_s
-    noise = power * _white_noise(kicks, weight)
+    pushes = _by_level(kicks).reshape(4, -1)
+    noise[level] += power * (pushes * np.tile(weight, 2)) @ pushes.T
     noise[np.ix_((2, 5), (2, 5))] = power * np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]])
-    by_turn = np.stack([by_angle[0].real, by_angle[0].imag, by_angle[1].real, by_angle[1].imag])
-    level_rows = [0, 1, 3, 4]
-    by_bias = np.zeros((6, len(sigmas)))
     if motion.has_gyro:
-        drift_power = np.radians(spec.rate_white_deg_rts) ** 2
-        noise[np.ix_(level_rows, level_rows)] += drift_power * (by_turn * weight) @ by_turn.T
-        by_bias[level_rows, 0] = -(by_turn @ weight) * sigmas[0]
-    if acceleration_m_s2 is not None:
-        facing = np.exp(-1j * heading_rad)
-        accelerations = (complex(facing * (path @ weight)), complex(facing * path[-1]))
-        for row, factor in zip((0, 3), accelerations, strict=True):
-            by_bias[row : row + 2, -3:-1] = -_complex_matrix(factor) * sigmas[-1]
-        by_bias[2, -1], by_bias[5, -1] = -(dt_s**2) / 2 * sigmas[-1], -dt_s * sigmas[-1]
-        heading_error = by_turn[:, 0] * heading_sigma_rad
-        noise[np.ix_(level_rows, level_rows)] += np.outer(heading_error, heading_error)
+        noise[level] += np.radians(spec.rate_white_deg_rts) ** 2 * (by_turn * weight) @ by_turn.T
+        by_bias[_LEVEL, 0] = -(by_turn @ weight) * sigmas[0]
     return DeadReckoning(transition, displacement, noise, by_bias, float(angle[-1]))
+
+
+def _by_level(moves: NDArray[Any]) -> Floats:
+    """Level place and speed by what their complex moves (2, ...) multiply: (4, 2, ...), east and north."""
+    both = np.stack([moves, 1j * moves], 1)
+    return np.stack([both.real, both.imag], 1).reshape(4, 2, *moves.shape[1:])
 
 
 def _simpson_nodes(t_s: Floats) -> tuple[Floats, Floats]:
@@ -145,22 +142,6 @@ def _integrate_turn(t_s: Floats, angle: Floats) -> Complex:
 def _integrate(t_s: Floats, values: NDArray[Any]) -> NDArray[Any]:
     area = np.cumsum(np.diff(t_s) * (values[1:] + values[:-1]) / 2)
     return np.concatenate([np.zeros(1, values.dtype), area])
-
-
-def _white_noise(kicks: Complex, weight: Floats) -> Floats:
-    """Covariance (6, 6) of place and speed, east and north, by white kicks of power 1."""
-    place, speed = kicks
-    noise = np.zeros((6, 6))
-    noise[:2, :2] = np.eye(2) * float(weight @ abs(place) ** 2)
-    noise[3:5, 3:5] = np.eye(2) * float(weight @ abs(speed) ** 2)
-    noise[:2, 3:5] = _complex_matrix(complex(weight @ (place * speed.conj())))
-    noise[3:5, :2] = noise[:2, 3:5].T
-    return noise
-
-
-def _complex_matrix(c: complex) -> Floats:
-    """Matrix that multiplies (east, north) as `c` does east + i north."""
-    return np.array([[c.real, -c.imag], [c.imag, c.real]])
 
 
 MotionSource = Callable[[float, float], ImuMotion | None]
