@@ -285,13 +285,6 @@ class _Stretch:
     changed: tuple[Floats, Floats]
 
 
-def _line_between(slope: float, low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Return where a line through 0 with this slope is between two heights."""
-    # A level line is never or always between them; a tiny slope stands for it.
-    slope = math.copysign(max(abs(slope), 1e-9), slope)
-    return np.minimum(low / slope, high / slope), np.maximum(low / slope, high / slope)
-
-
 _Block = tuple[_kernels.ActivePixels, tuple[Any, ...]]
 """The active pixels of a block of time, and the light on them, as arguments of `run_pixels`."""
 
@@ -647,9 +640,8 @@ class Simulation:
         Returns:
             The pixels, and how many of `_FAR_PX` they are beyond the strip, which is twice `half_px` wide.
         """
-        nothing = np.empty(0, np.int64), np.empty(0, np.uint8)
         if footprint.across[0] < least_w_m2:
-            return nothing
+            return np.empty(0, np.int64), np.empty(0, np.uint8)
         bend_px = sum(abs(drop.bend_px) for drop in self.scene.drops)
         reach_across, reach_along = (reach + 0.5 + bend_px for reach in footprint.reach_px(least_w_m2))
         middle = place[len(place) // 2]
@@ -660,28 +652,19 @@ class Simulation:
         offset = place[:, [0, -1]] - middle[[0, -1]]
         along = reach_along + float(np.abs(offset @ axis).max())
         across = reach_across + float(np.abs(offset @ np.array([axis[1], -axis[0]])).max())
-        height, width = self.scene.camera.height, self.scene.camera.width
-        reach = math.hypot(along, across)
-        top = max(math.floor(min(middle[0, 1], middle[-1, 1]) - reach), 0)
-        low = min(math.ceil(max(middle[0, 1], middle[-1, 1]) + reach) + 1, height)
-        if top >= low:
-            return nothing
-        rows = np.arange(top, low)
-        dy = rows - middle[0, 1]
-        sides = _line_between(axis[1], dy * axis[0] - across, dy * axis[0] + across)
-        ends = _line_between(axis[0], -along - dy * axis[1], length + along - dy * axis[1])
-        first = np.ceil(np.maximum(sides[0], ends[0]) + middle[0, 0]).clip(0, width).astype(int)
-        last = np.floor(np.minimum(sides[1], ends[1]) + middle[0, 0]).clip(-1, width - 1).astype(int)
-        counts = np.maximum(last - first + 1, 0)
-        begins = np.cumsum(counts) - counts
-        x = np.repeat(first - begins, counts) + np.arange(counts.sum())
-        y = np.repeat(rows, counts)
+        ends, reach = middle[[0, -1]], np.abs(axis) * along + np.abs(axis[::-1]) * across
+        size = self.scene.camera.width, self.scene.camera.height
+        left, top = np.floor(ends.min(0) - reach).clip(0, size).astype(int)
+        right, low = (np.ceil(ends.max(0) + reach) + 1).clip(0, size).astype(int)
+        y, x = np.mgrid[top:low, left:right]
         dx, dy = x - middle[0, 0], y - middle[0, 1]
-        across_px = np.abs(dx * axis[1] - dy * axis[0]) - half_px
-        along_px = np.abs(dx * axis[0] + dy * axis[1] - 0.5 * length) - 0.5 * length
-        distance_px = np.maximum(across_px, along_px) - bend_px
-        far = sum(((distance_px >= px).view(np.uint8) for px in _FAR_PX), np.zeros(len(x), np.uint8))
-        return y * width + x, far
+        aside, ahead = np.abs(dx * axis[1] - dy * axis[0]), np.abs(dx * axis[0] + dy * axis[1] - 0.5 * length)
+        lit = (aside <= across) & (ahead <= 0.5 * length + along)
+        distance_px = np.maximum(aside[lit] - half_px, ahead[lit] - 0.5 * length) - bend_px
+        far = sum(
+            ((distance_px >= px).view(np.uint8) for px in _FAR_PX), np.zeros(len(distance_px), np.uint8)
+        )
+        return (y * size[0] + x)[lit], far
 
 
 def _shift_requests(words: NDArray[np.int64], later_us: float) -> NDArray[np.int64]:
