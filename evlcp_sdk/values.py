@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from html import escape
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 import numpy as np
@@ -721,6 +722,7 @@ def sigmas(covariance: NDArray[np.float64]) -> list[float]:
     return deviations
 
 
+_K = TypeVar("_K")
 _V = TypeVar("_V")
 _S = TypeVar("_S", bound=np.generic)
 
@@ -740,6 +742,18 @@ def replace_fields(value: _V, **fields: Any) -> _V:
     copy = object.__new__(type(value))
     vars(copy).update(vars(value), **fields)
     return copy
+
+
+def remember_newest(known: dict[_K, _V], key: _K, value: _V, most: int) -> dict[_K, _V]:
+    """Put a value at the end of a dictionary; drop and return those at its front, beyond `most`.
+
+    >>> known = {1: "a", 2: "b"}
+    >>> remember_newest(known, 1, "c", 2), remember_newest(known, 3, "d", 2), known
+    ({}, {2: 'b'}, {1: 'c', 3: 'd'})
+    """
+    known.pop(key, None)
+    known[key] = value
+    return {old: known.pop(old) for old in list(islice(known, max(len(known) - most, 0)))}
 
 
 def to_kernel_array(array: NDArray[_S]) -> NDArray[_S]:

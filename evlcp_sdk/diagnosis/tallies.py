@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import asdict, dataclass, field
@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.formatting import round_or_none
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage, find_quantile_bin, sigmas
+from evlcp_sdk.values import (
+    Fix,
+    Frame,
+    Packet,
+    ReceivedMessage,
+    find_quantile_bin,
+    remember_newest,
+    sigmas,
+)
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import EstimatedBias, Navigator, Placed
@@ -52,8 +60,7 @@ class TransmitterTally:
     """Running figures of one transmitter, in constant memory.
 
     Args:
-        packet_frames: Frames of a packet.
-        nominal_packet_us: Length of a packet by the configuration, us.
+        form: Lengths of its packets' parts, by the configuration.
         link: Name of its link, where there are several.
         number: Its number.
 
@@ -65,7 +72,6 @@ class TransmitterTally:
         blocks: Packets whose block is decoded.
         first_symbols: Its first symbols, where a frame has one; -1 for one that was not received.
         path_box_px: Where it has been in the image: left, top, right, bottom.
-        packet_chips: Chips of a packet; 0 where unknown.
         chips_us: Sum of the lengths of a chip over its packets, us.
         beacon_m: Length of the bar by its newest beacon, m; NaN without.
         distorted_frames: Frames whose image is distorted.
@@ -74,8 +80,7 @@ class TransmitterTally:
             float64 (3, K - 1); empty before the first.
     """
 
-    packet_frames: int
-    nominal_packet_us: float
+    form: PacketFormat
     packets: int = 0
     frames: int = 0
     first_frame: int = -1
@@ -106,7 +111,6 @@ class TransmitterTally:
     path_box_px: tuple[float, float, float, float] = (math.inf, math.inf, -math.inf, -math.inf)
     link: str = ""
     number: int = 0
-    packet_chips: int = 0
     chips_us: float = 0.0
 
     def add(self, packet: Packet) -> None:
@@ -117,8 +121,8 @@ class TransmitterTally:
         self.frames += len(packet.frames)
         number, t_us = self.last_packet
         steps = packet.packet - number
-        step_us, nominal_us = packet.t_us - t_us, steps * self.nominal_packet_us
-        own_us = steps * self.packet_chips * packet.chip_us if self.first_symbols else step_us
+        step_us, nominal_us = packet.t_us - t_us, steps * self.form.packet_us
+        own_us = steps * self.form.packet_chips * packet.chip_us if self.first_symbols else step_us
         if (
             abs(step_us - nominal_us) < _MAX_CLOCK_ERROR * nominal_us
             and abs(step_us - own_us) < 0.75 * packet.chip_us + _CHIP_ERROR * nominal_us
@@ -130,7 +134,7 @@ class TransmitterTally:
             if message.beacon is not None:
                 self.beacon_m = message.beacon.length_m
         for frame in packet.frames:
-            number = frame.packet * self.packet_frames + frame.frame
+            number = frame.packet * self.form.frames + frame.frame
             self.first_frame = number if self.first_frame < 0 else self.first_frame
             self.last_frame = number
             left, top, right, bottom = self.path_box_px
@@ -199,8 +203,8 @@ class TransmitterTally:
         """
         if self.steps_us:
             return (self.nominal_steps_us / self.steps_us - 1) * 1e6
-        if self.first_symbols and self.packets > 1 and self.packet_chips:
-            return (self.nominal_packet_us / self.packet_chips * self.packets / self.chips_us - 1) * 1e6
+        if self.first_symbols and self.packets > 1:
+            return (self.form.packet_us / self.form.packet_chips * self.packets / self.chips_us - 1) * 1e6
         return math.nan
 
     def to_dict(self) -> dict[str, Any]:
@@ -210,6 +214,7 @@ class TransmitterTally:
         the newest frame.
         """
         return {
+            "transmitter": self.number,
             **({"link": self.link} if self.link else {}),
             "packets": self.packets,
             "frames_found": self.frames,
@@ -256,46 +261,36 @@ class RunTally:
     """
 
     def __init__(self, form: PacketFormat | Mapping[str, PacketFormat]) -> None:
-        self.transmitters: OrderedDict[int, TransmitterTally] = OrderedDict()
+        self.transmitters: dict[int, TransmitterTally] = {}
         self.dropped_transmitters = self.dropped_frames = 0
         self.covered_us = 0.0
-        self._messages: OrderedDict[tuple[int, int, int], ReceivedMessage] = OrderedDict()
+        self._messages: dict[tuple[int, int, int], ReceivedMessage] = {}
         self._forms = {"": form} if isinstance(form, PacketFormat) else form
         self._until_us = -math.inf
 
     def add(self, *packets: Packet) -> None:
         """Count packets and their frames."""
         for packet in packets:
-            form = self._forms[packet.link]
+            form, number = self._forms[packet.link], packet.transmitter
             packet_us = form.packet_us
-            if packet.transmitter not in self.transmitters:
-                self.transmitters[packet.transmitter] = TransmitterTally(
-                    *(packet.sent, packet_us),
-                    link=packet.link,
-                    number=packet.transmitter,
-                    packet_chips=form.packet_chips,
-                )
-            self.transmitters[packet.transmitter].add(packet)
+            tally = self.transmitters.get(number) or TransmitterTally(form, link=packet.link, number=number)
+            tally.add(packet)
             for message in packet.messages:
                 content = message.message
                 key = (content.transmitter_id, content.kind, content.sequence)
                 # A beacon's trust may change later.
-                self._messages.pop(key, None)
-                self._messages[key] = message
-                if len(self._messages) > MAX_MESSAGES:
-                    self._messages.popitem(last=False)
+                remember_newest(self._messages, key, message, MAX_MESSAGES)
             end_us = packet.t_us + packet_us
             self.covered_us += min(max(end_us - max(packet.t_us, self._until_us), 0.0), packet_us)
             self._until_us = end_us
-            self.transmitters.move_to_end(packet.transmitter)
-            if len(self.transmitters) > _MAX_TRANSMITTERS:
+            for dropped in remember_newest(self.transmitters, number, tally, _MAX_TRANSMITTERS).values():
                 self.dropped_transmitters += 1
-                self.dropped_frames += self.transmitters.popitem(last=False)[1].frames
+                self.dropped_frames += dropped.frames
 
     def of_link(self, name: str) -> RunTally:
         """The figures of one link's transmitters."""
         part = copy(self)
-        part.transmitters = OrderedDict((n, one) for n, one in self.transmitters.items() if one.link == name)
+        part.transmitters = {n: one for n, one in self.transmitters.items() if one.link == name}
         return part
 
     @property
@@ -341,10 +336,6 @@ class RunTally:
             }
             for one in self._messages.values()
         ]
-
-    def to_list(self) -> list[dict[str, Any]]:
-        """The figures of each transmitter as JSON values."""
-        return [{"transmitter": n} | tally.to_dict() for n, tally in sorted(self.transmitters.items())]
 
 
 @dataclass

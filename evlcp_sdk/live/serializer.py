@@ -17,7 +17,7 @@ from evlcp_sdk.results.lines import fix_line, format_frame
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.results.picture import encode_png
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Fix, Frame, ReceivedMessage
+from evlcp_sdk.values import Fix, Frame, ReceivedMessage, remember_newest
 
 _MAX_CHARACTERS: Final = 200
 """Of a message."""
@@ -44,8 +44,11 @@ class Serializer:
         """
         if news.kind != "frame":
             return [(kind, json.dumps({"line": kind} | values)) for kind, values in self._describe_news(news)]
-        self._keep_frame(news.value)
-        return [("frame", self._serialize_frame(news))] * frames
+        frame: Frame = news.value
+        remember_newest(self._bars, frame.transmitter, frame, _MAX_BARS)
+        late = "null" if news.late_ms is None else f"{news.late_ms:.3f}"
+        line = f'{format_frame(frame, self._columns)[:-1]}, "late_ms": {late}}}'
+        return [("frame", line)] * frames
 
     def serialize_picture(self, picture: Picture) -> tuple[str, bytes]:
         """The members `picture` and `bars` of a JSON object for a picture, and the picture as PNG.
@@ -57,11 +60,6 @@ class Serializer:
             latest = [one for one in self._bars.values() if one.t_us > picture.t_us - _BAR_MEMORY_US]
             self._last_picture = picture.number, _picture_json(picture, latest), encode_png(picture.paint())
         return self._last_picture[1:]
-
-    def _keep_frame(self, frame: Frame) -> None:
-        self._bars[frame.transmitter] = frame
-        if len(self._bars) > _MAX_BARS:
-            del self._bars[min(self._bars, key=lambda number: self._bars[number].t_us)]
 
     def _describe_news(self, news: News) -> list[tuple[str, dict[str, Any]]]:
         kind, value = news.kind, news.value
@@ -83,10 +81,6 @@ class Serializer:
             "speed_m_s": None if place.starts else round(place.speed_m_s, 2),
         }
         return [*self._describe_sites(fix), (kind, fix_line(fix) | map_fields)]
-
-    def _serialize_frame(self, news: News) -> str:
-        late = "null" if news.late_ms is None else f"{news.late_ms:.3f}"
-        return f'{format_frame(news.value, self._columns)[:-1]}, "late_ms": {late}}}'
 
     def _describe_sites(self, fix: Fix) -> list[tuple[str, dict[str, Any]]]:
         """The places of the bars in local metres, with the first given fix."""

@@ -10,7 +10,7 @@ from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.error_model import chi_square
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, site_of_transmitter
-from evlcp_sdk.values import Packet
+from evlcp_sdk.values import Packet, remember_newest
 
 _LENGTH_SHARE = 0.01
 """Share by which a beacon's length may differ from its site's: a lone bar's distance is wrong by as much."""
@@ -96,10 +96,9 @@ class BarRegistry:
         if packet.echo_of is not None:
             self._states.pop(packet.transmitter, None)
             return
-        state = self._states[packet.transmitter] = self._states.pop(packet.transmitter, _BeaconState())
+        state = self._states.get(packet.transmitter, _BeaconState())
         state.link = packet.link
-        if len(self._states) > _MAX_TRANSMITTERS:
-            del self._states[next(iter(self._states))]
+        remember_newest(self._states, packet.transmitter, state, _MAX_TRANSMITTERS)
         for received in packet.messages:
             if received.trust == "forged":
                 self.forged += 1

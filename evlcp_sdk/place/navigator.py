@@ -25,7 +25,7 @@ from evlcp_sdk.place.trajectory import (
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Fix, Packet
+from evlcp_sdk.values import Fix, Packet, remember_newest
 
 Floats = NDArray[np.float64]
 
@@ -346,11 +346,8 @@ class Navigator:
             self._last_used_us[fix.source] = fix.t_us
         self._attitude = self._attitude_at(fix.t_us) or self._attitude
         for cause in point.causes:
-            # Moves it to the end.
-            self._standing.pop(cause.name, None)
-            self._standing[cause.name] = point.standing(cause.name)  # type: ignore[assignment]
-        while len(self._standing) > _MAX_STANDING:
-            del self._standing[next(iter(self._standing))]
+            if (standing := point.standing(cause.name)) is not None:
+                remember_newest(self._standing, cause.name, standing, _MAX_STANDING)
         filtered = self._to_place(point)
         self._window.append((fix, point, filtered))
         return Placed(fix, filtered, self._smooth_oldest(_BLOCK) if len(self._window) == 2 * _BLOCK else ())

@@ -1,18 +1,15 @@
 """`summary.json`: what a run found, in which recording, how fast, and what was lost."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from evlcp_sdk.diagnosis.checks import run_checks
 from evlcp_sdk.diagnosis.facts import Facts
+from evlcp_sdk.diagnosis.tallies import TransmitterTally
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import writing
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.plugin.records import SUMMARY
 from evlcp_sdk.plugin.source import Loss
-from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.packets_jsonl import decode_characters
 
 Status = Literal["complete", "degraded", "interrupted", "failed"]
@@ -75,7 +72,9 @@ def build_summary(
         "status": end.status,
         "error": end.error,
         "result": tally.headline(),
-        "transmitters": [one | _character_text(one, facts) for one in tally.to_list()],
+        "transmitters": [
+            one.to_dict() | _character_text(one, facts) for _, one in sorted(tally.transmitters.items())
+        ],
         "recording": dict(end.recording),
         "processing": dict(end.processing),
         "counts": dict(facts.counts),
@@ -93,13 +92,11 @@ def build_summary(
     }
 
 
-def _character_text(figures: Mapping[str, Any], facts: Facts) -> dict[str, Any]:
+def _character_text(one: TransmitterTally, facts: Facts) -> dict[str, Any]:
     """A transmitter's text, if its framing sends characters and it sends no blocks."""
-    part = facts.parts.get(figures.get("link", ""), facts)
-    one = facts.tally.transmitters[figures["transmitter"]]
-    if not part.link.characters_on_air or one.blocks:
-        return {}
-    return {"text": decode_characters(one.first_symbols)}
+    link = facts.parts.get(one.link, facts).link
+    is_text = link.characters_on_air and not one.blocks
+    return {"text": decode_characters(one.first_symbols)} if is_text else {}
 
 
 def _describe_link(link: Link) -> dict[str, Any]:
@@ -109,16 +106,6 @@ def _describe_link(link: Link) -> dict[str, Any]:
         "revisions": dict(link.revisions),
         "configuration": {section: dict(keys) for section, keys in link.table.items()},
     }
-
-
-def write_summary(table: Mapping[str, Any], folder: ResultFolder) -> None:
-    """Write `summary.json`.
-
-    Raises:
-        OutputError: It cannot be written.
-    """
-    with writing(folder.folder):
-        folder.open(SUMMARY).write(json.dumps(table, indent=2) + "\n")
 
 
 def messages_off_reason(link: Link) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
@@ -14,15 +15,16 @@ from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.diagnosis.probe import find_other_codewords
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.diagnosis.tallies import PositionTally, RunTally
+from evlcp_sdk.files import writing
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import name_links, select_positioning_links
-from evlcp_sdk.plugin.records import choose_sinks, find_sinks
+from evlcp_sdk.plugin.records import SUMMARY, choose_sinks, find_sinks
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.lines import JsonLines
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.sinks import Sinks, load_sinks
-from evlcp_sdk.results.summary import RunEnd, build_summary, messages_off_reason, write_summary
+from evlcp_sdk.results.summary import RunEnd, build_summary, messages_off_reason
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Packet
@@ -149,7 +151,8 @@ class ResultWriter:
         if self._folder is not None:
             self._sinks.conclude(table)
             table["files"] = self._folder.digests()
-            write_summary(table, self._folder)
+            with writing(self._folder.folder):
+                self._folder.open(SUMMARY).write(json.dumps(table, indent=2) + "\n")
             self._folder.finish()
         return table
 

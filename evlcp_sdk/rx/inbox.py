@@ -1,6 +1,5 @@
 """Packets to messages: soft bits to blocks, blocks to messages, signatures to trust."""
 
-from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.trust import BeaconVerifier, TrustVerdict, describe_signature
 from evlcp_sdk.utc import ClockZero, clock_zero_at
-from evlcp_sdk.values import Packet, ReceivedMessage, replace_fields
+from evlcp_sdk.values import Packet, ReceivedMessage, remember_newest, replace_fields
 
 _LLR_POWER, _MAX_LLR = 0.5, 7.0
 """Power that magnitudes of LLRs are raised to, as decoders are overconfident within a burst, and their limit
@@ -78,8 +77,8 @@ class _Inbox:
     """Blocks and messages of one transmitter, in bounded memory."""
 
     sums: list[_BlockSum] = field(default_factory=list)
-    incomplete: OrderedDict[_Key, _PartialMessage] = field(default_factory=OrderedDict)
-    complete: OrderedDict[_Key, _PartialMessage] = field(default_factory=OrderedDict)
+    incomplete: dict[_Key, _PartialMessage] = field(default_factory=dict)
+    complete: dict[_Key, _PartialMessage] = field(default_factory=dict)
 
 
 class MessageAssembler:
@@ -120,7 +119,7 @@ class MessageAssembler:
         self._room = coder.block_bytes - HEADER_BYTES
         self._beacon_verifier = BeaconVerifier(spec, coder.digest)
         self._clock_zero = clock_zero
-        self._inboxes: OrderedDict[int, _Inbox] = OrderedDict()
+        self._inboxes: dict[int, _Inbox] = {}
         self.counts = dict.fromkeys(_COUNTS, 0)
 
     @classmethod
@@ -148,10 +147,9 @@ class MessageAssembler:
         if packet.echo_of is not None:
             self.counts["blocks_reflected"] += 1
             return packet
-        inbox = self._inboxes.setdefault(packet.transmitter, _Inbox())
-        self._inboxes.move_to_end(packet.transmitter)
-        while len(self._inboxes) > _MAX_TRANSMITTERS:
-            self._count_missing(self._inboxes.popitem(last=False)[1].incomplete.values())
+        inbox = self._inboxes.get(packet.transmitter, _Inbox())
+        for old in remember_newest(self._inboxes, packet.transmitter, inbox, _MAX_TRANSMITTERS).values():
+            self._count_missing(old.incomplete.values())
         self.counts["blocks_tried"] += 1
         content, packets = self._decode_packet(inbox, self._calibrate_llr(packet))
         if content is None:
@@ -220,11 +218,9 @@ class MessageAssembler:
             if key in inbox.incomplete:
                 self._count_missing([inbox.incomplete.pop(key)])
         total = total_bytes(block.length, self._room)
-        partial = inbox.incomplete.setdefault(key, _PartialMessage(block.length, total))
-        inbox.incomplete.move_to_end(key)
+        partial = inbox.incomplete.get(key, _PartialMessage(block.length, total))
         partial.parts[block.index] = block.part
-        while len(inbox.incomplete) > _MAX_MESSAGES:
-            self._count_missing([inbox.incomplete.popitem(last=False)[1]])
+        self._count_missing(remember_newest(inbox.incomplete, key, partial, _MAX_MESSAGES).values())
         if sum(map(len, partial.parts.values())) != partial.total:
             return []
         try:
@@ -234,9 +230,7 @@ class MessageAssembler:
             self.counts["messages_mixed"] += 1
             partial.parts = {block.index: block.part}
             return []
-        inbox.complete[key] = inbox.incomplete.pop(key)
-        while len(inbox.complete) > _MAX_MESSAGES:
-            inbox.complete.popitem(last=False)
+        remember_newest(inbox.complete, key, inbox.incomplete.pop(key), _MAX_MESSAGES)
         return self._deliver(inbox, key, packet)
 
     def _deliver(self, inbox: _Inbox, key: _Key, packet: Packet) -> list[ReceivedMessage]:
@@ -247,7 +241,7 @@ class MessageAssembler:
         known = inbox.complete.get(key)
         if known is None:
             return []
-        inbox.complete.move_to_end(key)
+        remember_newest(inbox.complete, key, known, _MAX_MESSAGES)
         message = Message(key[1], transmitter_id, sequence, known.payload)
         kind = self._kinds[message.kind]
         try:

@@ -8,7 +8,7 @@ all links, however many bits their symbols have. A transmitter that explains hal
 other links drop their regions there.
 """
 
-from collections import Counter, OrderedDict, deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.regions import is_same_place
 from evlcp_sdk.rx.rhythm import BlinkDetector
-from evlcp_sdk.values import Frame, Packet, Region, replace_fields
+from evlcp_sdk.values import Frame, Packet, Region, remember_newest, replace_fields
 
 _CLEARLY = 1.25
 """How many times more light one link explains than another before nothing else matters."""
@@ -112,12 +112,8 @@ class LinkArbiter:
         """Add the packets that a link has decoded, and where its transmitters are now, by their numbers."""
         self._places[link] = places
         for number, place in places.items():
-            self._last_places.pop(number, None)
-            self._last_places[number] = place
-        while len(self._last_places) > _MAX_TRANSMITTERS:
-            number = next(iter(self._last_places))
-            del self._last_places[number]
-            self.owners.discard(number)
+            dropped = remember_newest(self._last_places, number, place, _MAX_TRANSMITTERS)
+            self.owners.difference_update(dropped)
         form, clusters = self._links[link].packet, self._links[link].codebook.clusters
         for packet in packets:
             newest = packet.frames[-1]
@@ -214,18 +210,14 @@ class FrameReporter:
     def __init__(self, report: Callable[[Frame], None] | None) -> None:
         self._report = report
         # By transmitter, then by number of packet and frame; None for a frame that was reported.
-        self._frames: OrderedDict[int, OrderedDict[tuple[int, int], Frame | None]] = OrderedDict()
+        self._frames: dict[int, dict[tuple[int, int], Frame | None]] = {}
         self.withdrawn = 0
 
     def add_frame(self, frame: Frame, *, owns_place: bool) -> None:
         """Add the next frame of a transmitter, which owns its place now or not."""
-        frames = self._frames.setdefault(frame.transmitter, OrderedDict())
-        frames[frame.packet, frame.frame] = frame
-        if len(frames) > _MAX_FRAMES:
-            frames.popitem(last=False)
-        self._frames.move_to_end(frame.transmitter)
-        if len(self._frames) > _MAX_TRANSMITTERS:
-            self._frames.popitem(last=False)
+        frames = self._frames.get(frame.transmitter, {})
+        remember_newest(frames, (frame.packet, frame.frame), frame, _MAX_FRAMES)
+        remember_newest(self._frames, frame.transmitter, frames, _MAX_TRANSMITTERS)
         if owns_place:
             self._report_waiting(frame.transmitter)
 
@@ -246,7 +238,7 @@ class FrameReporter:
 
     def _report_waiting(self, number: int) -> None:
         assert self._report is not None
-        frames = self._frames.get(number, OrderedDict())
+        frames = self._frames.get(number, {})
         for key, frame in frames.items():
             if frame is not None:
                 frames[key] = None
@@ -254,7 +246,7 @@ class FrameReporter:
 
     def _forget_packet(self, packet: Packet) -> set[tuple[int, int]]:
         """Forget a packet's frames, and those of earlier ones; return which of its frames were reported."""
-        frames = self._frames.get(packet.transmitter, OrderedDict())
+        frames = self._frames.get(packet.transmitter, {})
         past = {key: frames.pop(key) for key in list(frames) if key[0] <= packet.packet}
         return {key for key, frame in past.items() if key[0] == packet.packet and frame is None}
 

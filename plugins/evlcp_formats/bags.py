@@ -5,7 +5,6 @@ import re
 import sqlite3
 import struct
 import zlib
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import ChunkReader, RawSource, format_header
 from evlcp_sdk.io.urls import split_options
 from evlcp_sdk.plugin.source import Loss
+from evlcp_sdk.values import remember_newest
 
 TYPES: Final = ("event_camera_msgs/msg/EventPacket", "event_camera_msgs/EventPacket")
 
@@ -115,7 +115,7 @@ class _PacketReader(ChunkReader):
     def __init__(self, path: Path, packets: Iterator[EventPacket]) -> None:
         self._path = path
         self._waiting: dict[int, EventPacket] = {}
-        self._past: OrderedDict[int, int] = OrderedDict()
+        self._past: dict[int, int] = {}
         self._next_seq: int | None = None
         self.twice = self.out_of_order = self.lost = self.first_lost = 0
         ordered = self._sort(packets)
@@ -146,10 +146,7 @@ class _PacketReader(ChunkReader):
         last = next(reversed(self._past), math.inf)
         near = [seq for seq in self._waiting if last < seq <= last + 1 + _MAX_WAITING]
         packet = self._waiting.pop(min(near or self._waiting))
-        self._past[packet.seq] = zlib.crc32(packet.data)
-        self._past.move_to_end(packet.seq)
-        if len(self._past) > _MAX_WAITING:
-            self._past.popitem(last=False)
+        remember_newest(self._past, packet.seq, zlib.crc32(packet.data), _MAX_WAITING)
         return packet
 
     def read_chunk(self) -> memoryview:
@@ -295,7 +292,8 @@ def _read_ros1(path: Path, topic: str | None, stack: ExitStack) -> Iterator[Even
     reader = stack.enter_context(rosbag1.Reader(path))
     chosen = _choose_topic(path, {one.topic: one.msgtype for one in reader.connections}, topic)
     for _, _, data in reader.messages([one for one in reader.connections if one.topic == chosen]):
-        yield _parse_ros1(path, data)
+        # Fields without padding, and a header with a number of its own.
+        yield _parse_packet(path, data, "<", "IIIsIIQQsBs", aligned=False)
 
 
 _READERS: Final = {
@@ -308,11 +306,6 @@ _READERS: Final = {
 def _parse_cdr(path: Path, data: bytes) -> EventPacket:
     """Parse a message of ROS 2: aligned fields after four bytes with the byte order."""
     return _parse_packet(path, data[4:], "<" if data[1:2] == b"\x01" else ">", "iIsIIQQsBs", aligned=True)
-
-
-def _parse_ros1(path: Path, data: bytes) -> EventPacket:
-    """Parse a message of ROS 1: fields without padding, and a header with a number of its own."""
-    return _parse_packet(path, data, "<", "IIIsIIQQsBs", aligned=False)
 
 
 def _parse_packet(path: Path, data: bytes, order: str, codes: str, *, aligned: bool) -> EventPacket:

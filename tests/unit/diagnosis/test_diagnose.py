@@ -127,7 +127,7 @@ def first_failure(*sources: LightSource, quality=1.0, frames=0, rejected=0, dura
     """What is wrong first of all with light that the survey told, and what the receiver made of it."""
     tally = RunTally(LINK.packet)
     if frames:
-        one = tally.transmitters[0] = TransmitterTally(10, 34_600.0)
+        one = tally.transmitters[0] = TransmitterTally(LINK.packet)
         one.frames, one.quality_sum, one.first_frame, one.last_frame = frames, quality * frames, 0, frames - 1
         one.symbol_counts.update(range(64))
         one.ranged_frames = frames

@@ -170,7 +170,7 @@ def test_the_summary_names_every_file_by_its_digest(tmp_path: Path) -> None:
 
 
 def test_the_median_needs_no_memory_of_every_frame() -> None:
-    tally = TransmitterTally(3, 100.0)
+    tally = TransmitterTally(LINK.packet)
     distances = np.random.default_rng(1).normal(60.0, 2.0, 999)
     for i in range(0, 999, 3):
         tally.add(packet(i // 3, *(frame(i // 3, k, float(distances[i + k])) for k in range(3))))
