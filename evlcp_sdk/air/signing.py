@@ -205,24 +205,19 @@ class TrustedKeys:
 
     def __init__(self, trusted: Sequence[TrustedKey], revoked: Sequence[str] = ()) -> None:
         revoked_keys = [_parse_public_key(t, f"messages.revoked_keys[{i}]") for i, t in enumerate(revoked)]
-        self._revoked = frozenset(map(_key_name, revoked_keys))
         self._keys = {_key_name(key): key for key in revoked_keys}
-        self._grants: dict[bytes, tuple[TrustedKey, ...]] = {}
+        self._grants: dict[bytes, list[TrustedKey]] = {name: [] for name in self._keys}
         for grant in trusted:
             key = bytes.fromhex(grant.key)
-            name = _key_name(key)
-            self._keys[name] = key
-            self._grants[name] = (*self._grants.get(name, ()), grant)
+            if key not in revoked_keys:
+                self._keys[_key_name(key)] = key
+                self._grants.setdefault(_key_name(key), []).append(grant)
         if self._keys:
             _require_cryptography()
 
-    def is_revoked(self, signature: Message) -> bool:
-        """Whether the key that a signature names is revoked."""
-        return signature.payload[:KEY_NAME_BYTES] in self._revoked
-
-    def find_grants(self, signature: Message) -> tuple[TrustedKey, ...]:
-        """What the key that a signature names may sign; empty for an untrusted key."""
-        return self._grants.get(signature.payload[:KEY_NAME_BYTES], ())
+    def find_grants(self, signature: Message) -> Sequence[TrustedKey]:
+        """What the key that a signature names may sign; empty for a revoked key."""
+        return self._grants[signature.payload[:KEY_NAME_BYTES]]
 
     def verify(self, beacon: Message, codebook: bytes, signature: Message) -> bool | None:
         """Whether the signature that came with a beacon is correct; None if it names no known key.

@@ -1,7 +1,6 @@
 """Verify beacons: by their signatures, what these keys may sign, and the beacons verified before."""
 
 import time
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,7 +12,7 @@ from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.air.signing import TrustedKey, TrustedKeys
 from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.scene.sites import LocalAxes
-from evlcp_sdk.values import Trust
+from evlcp_sdk.values import Trust, remember_newest
 
 _MAX_VERIFIED = 4096
 """Transmitter ids whose last verified beacon is remembered: those received last."""
@@ -56,7 +55,7 @@ class BeaconVerifier:
         self._spec = spec
         self._codebook = codebook
         self._keys = TrustedKeys(spec.trusted_keys, spec.revoked_keys)
-        self._verified: OrderedDict[int, _Verified] = OrderedDict()
+        self._verified: dict[int, _Verified] = {}
 
     def verify(
         self, message: Message, beacon: Beacon, signature: Message | None, now_s: float | None
@@ -71,7 +70,7 @@ class BeaconVerifier:
         """
         last = self._verified.get(message.transmitter_id)
         if last is not None and last.message == message:
-            self._verified.move_to_end(message.transmitter_id)
+            remember_newest(self._verified, message.transmitter_id, last, _MAX_VERIFIED)
             return self._check_time(message, last.grants, now_s)
         if last is not None and message.sequence < last.message.sequence:
             newer = last.message.sequence
@@ -97,9 +96,10 @@ class BeaconVerifier:
             return TrustVerdict("unverified", "signed by a key that is not trusted")
         if not is_good:
             return TrustVerdict("forged", "the signature is not that of this beacon")
-        if self._keys.is_revoked(signature):
+        granted = self._keys.find_grants(signature)
+        if not granted:
             return TrustVerdict("forged", "signed by a key that is revoked")
-        grants = [one for one in self._keys.find_grants(signature) if one.covers_id(message.transmitter_id)]
+        grants = [one for one in granted if one.covers_id(message.transmitter_id)]
         if not grants:
             return TrustVerdict(
                 "forged", f"signed by a key that is not for transmitter {message.transmitter_id}"
@@ -112,10 +112,8 @@ class BeaconVerifier:
             return TrustVerdict("forged", f"replayed: sequence {message.sequence} is older than {oldest}")
         verdict = self._check_time(message, grants, now_s)
         if verdict.trust == "verified":
-            self._verified[message.transmitter_id] = _Verified(message, beacon, grants)
-            self._verified.move_to_end(message.transmitter_id)
-            while len(self._verified) > _MAX_VERIFIED:
-                self._verified.popitem(last=False)
+            verified = _Verified(message, beacon, grants)
+            remember_newest(self._verified, message.transmitter_id, verified, _MAX_VERIFIED)
         return verdict
 
     def _check_time(
