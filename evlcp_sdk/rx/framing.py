@@ -34,6 +34,7 @@ from evlcp_sdk.rx.transmitters import (
     measure_row_delay,
     retime_lock,
 )
+from evlcp_sdk.rx.workers import AnyBarDecoder
 from evlcp_sdk.values import Events, Frame, Region, SyncLock, replace_fields
 
 _TAIL_CHIPS = 0.5
@@ -164,7 +165,7 @@ class PacketFramer(Framer):
             link, "synchronization", link.codebook, link.packet, methods=("init", "step")
         )
         self._decoder, self._aligner = decoder, decoder.aligner
-        self._bar_decoders: Sequence[BarDecoder] = (
+        self._bar_decoders: Sequence[AnyBarDecoder] = (
             [BarDecoder(decoder)] if stream.bar_decoders is None else stream.bar_decoders(name)
         )
         self._pending: deque[PendingFrame] = deque()

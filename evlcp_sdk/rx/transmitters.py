@@ -20,9 +20,10 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import DueFrame
 from evlcp_sdk.rx.limits import Limits
-from evlcp_sdk.rx.reading import BarDecoder, BarState
+from evlcp_sdk.rx.reading import BarState
 from evlcp_sdk.rx.reflections import MAX_ROW_US, PacketAssembler
 from evlcp_sdk.rx.regions import RegionTrack, TrackedRegion
+from evlcp_sdk.rx.workers import AnyBarDecoder
 from evlcp_sdk.values import Events, SyncLock, replace_fields
 
 LOOKBACK_PACKETS = 2
@@ -257,7 +258,7 @@ class Transmitter:
     first_lit_us: float | None = None
     step_events: int = 0
     strayed: bool = True
-    decoder: BarDecoder | None = None
+    decoder: AnyBarDecoder | None = None
 
     def fetch_state(self) -> BarState:
         """Fetch the state back from the decoder, if one has it."""

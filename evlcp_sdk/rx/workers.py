@@ -83,10 +83,10 @@ class Workers:
         shared = {name: link for name, link in links.items() if has_bar_frames(link)}
         return cls(shared, processes - 1) if processes > 1 and shared else None
 
-    def bar_decoders(self, link: str) -> list["_WorkerBarDecoder"]:
+    def bar_decoders(self, link: str) -> list["WorkerBarDecoder"]:
         """A decoder in each worker for the bars of a link; none where that has no bars."""
         workers = self._workers if link in self._links else []
-        return [_WorkerBarDecoder(worker, link, self._links[link].regions.step_us) for worker in workers]
+        return [WorkerBarDecoder(worker, link, self._links[link].regions.step_us) for worker in workers]
 
     def close(self) -> None:
         """End the processes."""
@@ -218,8 +218,8 @@ class _Worker:
         return WorkerError(f"{self._name} ended {how}; what it was decoding is lost: receive again")
 
 
-class _WorkerBarDecoder(BarDecoder):
-    """Hands the frames of a link's bars to the decoder of a worker."""
+class WorkerBarDecoder:
+    """Hands the frames of a link's bars to the `BarDecoder` of a worker; used like that one."""
 
     is_immediate = False
 
@@ -249,6 +249,10 @@ class _WorkerBarDecoder(BarDecoder):
         bare = TrackedRegion(region.id, region.track, region.first_us, size_px=region.size_px)
         content = job._replace(region=bare), places
         return self._worker.request("decode", self._link, bar, content, memory=memory)
+
+
+AnyBarDecoder = BarDecoder | WorkerBarDecoder
+"""Decodes the frames of bars, here or in a worker."""
 
 
 def _make_poller(pipe: Connection) -> select.poll:

@@ -18,7 +18,7 @@ ROWS = {
     "evlcp_sdk/rx": (
         *("_kernels", "boxes distortion limits", "rhythm sweeps", "guard regions trust", "detector"),
         *("inbox placement ranges", "points spread", "alignment reflections", "framer", "reading"),
-        *("plugin_framing transmitters workers", "framing multi", "receiver"),
+        *("plugin_framing workers", "transmitters", "framing multi", "receiver"),
     ),
     "firmware_host": (
         *("errors build flicker images", "protocol", "ports", "emulators", "board", "loop", "commands"),
