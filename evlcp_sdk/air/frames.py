@@ -76,14 +76,6 @@ class PacketFormat:
         """Whether a frame of the packet starts with a pilot."""
         return frame % self.pilot_every == 0
 
-    def pilot_frame(self, frame: int) -> int:
-        """The frame whose pilot counts for a frame of the packet: itself, or the last before it with one.
-
-        >>> [PacketFormat(pilot_every=4).pilot_frame(n) for n in range(6)]
-        [0, 0, 0, 0, 4, 4]
-        """
-        return frame - frame % self.pilot_every
-
     def frame_start_chip(self, frame: int) -> int:
         """Chip of the packet at which a frame starts: with its pilot, or with its info segment."""
         pilots = -(-frame // self.pilot_every)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
-from typer.models import CommandInfo
 
 from evlcp_sdk.cli._common import echo, log_on_stderr, silence_matplotlib
 from evlcp_sdk.formatting import escape_controls
@@ -126,12 +125,10 @@ def add_plugin_commands(app: typer.Typer, registry: "Registry") -> None:
 
 
 def _command_names(app: typer.Typer) -> set[str]:
-    commands = {_command_name(command) for command in app.registered_commands}
-    return commands | {group.name or "" for group in app.registered_groups}
-
-
-def _command_name(command: CommandInfo) -> str:
-    return command.name or str(getattr(command.callback, "__name__", "")).lower().replace("_", "-")
+    names = {group.name or "" for group in app.registered_groups}
+    for command in app.registered_commands:
+        names.add(command.name or str(getattr(command.callback, "__name__", "")).lower().replace("_", "-"))
+    return names
 
 
 def _find_fault(added: typer.Typer, known: set[str]) -> str | None:

@@ -170,7 +170,7 @@ def diagnose(
     )
 
 
-def infer_link(source: EventSource, link: Link, registry: Registry | None = None) -> list[Trial]:
+def infer_link(source: EventSource, link: Link) -> list[Trial]:
     """Infer links that may have sent a recording, the best first, as `receive --link auto` does.
 
     Tries chip rates of the light, modulations, frames per packet and frames per pilot; all else is as given.
@@ -180,13 +180,12 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
     Raises:
         InputError: The source cannot be read on.
     """
-    registry = Registry.load() if registry is None else registry
     recording = _RecordingPass(link)
     for _ in recording.read(source):
         if recording.has_regions and recording.is_full:
             break
     sources, _ = recording.survey.find_sources()
-    trials = recording.try_links(sources, registry)
+    trials = recording.try_links(sources, Registry.load())
     return sorted(trials, key=lambda one: one.rank, reverse=True)
 
 

@@ -96,11 +96,6 @@ class Codec:
         partial = self.rollover[: third * (3 * step >> high)] if rollovers else ()
         return np.array(self.rollover * rollovers + partial, self.word), (first_us >> low) - 1
 
-    def find_reserved(self, words: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which words are of a type that does not exist, bool (n,)."""
-        kinds = words >> (8 * self.word.itemsize - 4)
-        return np.asarray(self.types >> kinds.astype(np.int64) & 1 == 0)
-
 
 def encode_evt2(
     words: NDArray[np.uint32],

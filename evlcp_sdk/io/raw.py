@@ -256,7 +256,8 @@ class RawSource(EventSource):
     def _check_encoding(self) -> None:
         """Raise a RawFormatError if the first words look like another encoding."""
         words = self._get_words()[:RESERVED_PROBE_WORDS]
-        reserved = self._codec.find_reserved(words)
+        kinds = words >> (8 * words.itemsize - 4)
+        reserved = self._codec.types >> kinds.astype(np.int64) & 1 == 0
         share = np.count_nonzero(reserved) / max(len(words), 1)
         # If only later words are wrong, bytes are missing, which the decoder handles.
         first = reserved[:RESERVED_FIRST_WORDS].mean() if len(words) else 0.0

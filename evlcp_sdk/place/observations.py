@@ -307,10 +307,6 @@ class Problem:
         )
         return remaining._check_determined()
 
-    def with_camera_sigma(self, sigma: CameraSigma) -> "Problem":
-        """The same with other sigmas of the camera."""
-        return replace(self, lens_root=sigma.covariance_root(self.camera))
-
     def _check_determined(self) -> "Problem | Rejection":
         """This problem, or why its attitude is too little for its bars."""
         bars = len(self.transmitters)

@@ -124,7 +124,8 @@ def _fit_without_each_part(
             parts["heading"] = problem.with_attitude(replace(attitude, heading_deg=None))
         if attitude is not None:
             parts["attitude"] = problem.with_attitude(None)
-    parts[FOCAL] = problem.with_camera_sigma(replace(sigma, focal_mm=focal_mm, correlation=()))
+    sigma = replace(sigma, focal_mm=focal_mm, correlation=())
+    parts[FOCAL] = replace(problem, lens_root=sigma.covariance_root(problem.camera))
     largest = max(tests.values(), default=0.0)
     least = _HOPELESS_SHARE * largest if largest > _LARGE_TEST else -math.inf
     hopeless = {name for name in parts if tests.get(name, largest) < least}

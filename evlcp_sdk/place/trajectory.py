@@ -288,7 +288,7 @@ def step_trajectory(
         turn = math.remainder(fix.heading_deg - state.heading_deg, 360.0)
         recent = fix.t_us - state.heading_t_us <= _TURN_US
         turn_rad = math.radians(turn) if recent and math.isfinite(turn) else 0.0
-        motion = ImuMotion.from_uniform_turn((fix.t_us - state.t_us) * 1e-6, turn_rad)
+        motion = ImuMotion(np.array([0.0, (fix.t_us - state.t_us) * 1e-6]), np.array([0.0, turn_rad]))
     predicted = _add_fix_causes(_predict(state, fix.t_us, motion, spec), fix)
     predicted, observation = _observe_on_course(predicted, fix)
     innovation = fix.enu_m - observation @ predicted.mean

@@ -140,10 +140,6 @@ class Plot:
         for part in _find_runs(np.column_stack([lower, upper])):
             self._add_shape(Shape("band", colour, np.concatenate([lower[part], upper[part][::-1]]), name))
 
-    def add_ring(self, points: NDArray[np.float64], colour: str, name: str = "") -> None:
-        """Draw a closed line through points, float64 (n, 2)."""
-        self._add_shape(Shape("ring", colour, points, name))
-
     def add_name(self, x: float, y: float, text: str) -> None:
         """Write a text beside a point."""
         self.names.append((x, y, text))

@@ -235,7 +235,7 @@ def _plot_maps(
         name = "95 % ellipse" + (f", {scale} times as large" if scale > 1 else "")
         for fix in selected:
             ring = ellipse_points(fix.enu_m[:2], fix.covariance_m2[:2, :2] * scale**2, 0.95)
-            close.add_ring(ring, "#999999", name)
+            close.add_line(ring[:, 0], ring[:, 1], "#999999", name, kind="ring")
         for plot in (plan, close):
             for line, colour, name in _track_lines(points):
                 plot.add_line(line[:, 0], line[:, 1], colour, name)

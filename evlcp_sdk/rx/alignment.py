@@ -148,7 +148,7 @@ class FrameAligner:
         seen_us = due.middle_us + chip_us / 2
         if due.has_pilot:
             size = self._image_size(*region.track.size_at(seen_us))
-        elif pilot is None or pilot.frame != due.number - due.index + packet.pilot_frame(due.index):
+        elif pilot is None or pilot.frame != due.number - due.index % packet.pilot_every:
             return None
         else:
             size = pilot.size_px

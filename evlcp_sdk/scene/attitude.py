@@ -124,11 +124,6 @@ class ImuMotion:
     has_gyro: bool = False
     acceleration_m_s2: NDArray[np.float64] | None = None
 
-    @classmethod
-    def from_uniform_turn(cls, dt_s: float, turn_rad: float) -> "ImuMotion":
-        """A turn at a constant rate."""
-        return cls(np.array([0.0, dt_s]), np.array([0.0, turn_rad]))
-
 
 @dataclass(frozen=True, eq=False)
 class AttitudeLog:

@@ -63,10 +63,10 @@ def pack_sensor(sensor: SensorSpec) -> Floats:
     )
 
 
-def tabulate_quantiles(nodes: int = 4097) -> Floats:
+def tabulate_quantiles() -> Floats:
     """Tabulate the quantiles of the cut-off normal distribution at even steps of probability."""
     edge = ndtr(-_kernels.NOISE_LIMIT)
-    return ndtri(edge + np.linspace(0, 1, nodes) * (1 - 2 * edge))
+    return ndtri(edge + np.linspace(0, 1, 4097) * (1 - 2 * edge))
 
 
 def seed_key(seed: int) -> np.uint64:

@@ -166,10 +166,6 @@ def _frames_cell(m: Measurement) -> str:
     return f"{tally.frames_found}/{tally.frames_sent}" if tally.frames_sent else str(m.statistics.rows)
 
 
-def _ber_cell(m: Measurement) -> str:
-    return "0" if m.ber.is_zero else format_number(m.ber.value, ".1e")
-
-
 def _interval_cell(m: Measurement) -> str:
     ber = m.ber
     if ber.is_zero:
@@ -180,7 +176,7 @@ def _interval_cell(m: Measurement) -> str:
 COLUMNS = (
     Column("found_share", "frames", _frames_cell, "most"),
     Column("packets", "packets", "d"),
-    Column("ber", "BER", _ber_cell, "least"),
+    Column("ber", "BER", lambda m: "0" if m.ber.is_zero else format_number(m.ber.value, ".1e"), "least"),
     Column("ber_interval", "95 %", _interval_cell),
     Column("erased_share", "erased", lambda m: f"{m.tally.erased_share:.1%}" if m.tally.erased else "-"),
     Column("claimed_share", "claimed", lambda m: f"{m.tally.claimed_share:.1%}" if m.tally.claimed else "-"),

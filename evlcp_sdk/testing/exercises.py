@@ -1,7 +1,6 @@
 """Links and compiled algorithms for laws, and one simple task a role."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
 
@@ -181,18 +180,14 @@ def run_filter(follow: Any, values: Any, peek: Callable[[Any, float], Any] | Non
     return out
 
 
-@dataclass(frozen=True)
-class Exercise:
-    """A task: inputs with arrays, and what compiles the algorithm again to a function of them."""
+def make_exercise(subject: Subject) -> tuple[tuple[Any, ...], Callable[[], Callable[..., Any]]]:
+    """Make the task of the subject's role, on its link.
 
-    inputs: tuple[Any, ...]
-    prepare: Callable[[], Callable[..., Any]]
-
-
-def make_exercise(subject: Subject) -> Exercise:
-    """Make the task of the subject's role, on its link."""
+    Returns:
+        Inputs with arrays, and what compiles the algorithm again to a function of them.
+    """
     inputs, run = _EXERCISES[subject.role]
-    return Exercise(inputs(subject), lambda: partial(run, compile_subject(subject)))
+    return inputs(subject), lambda: partial(run, compile_subject(subject))
 
 
 def _draw_events(packets: int) -> Callable[[Subject], tuple[Any, ...]]:

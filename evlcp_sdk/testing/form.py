@@ -85,16 +85,16 @@ def _check_compile(subject: Subject) -> None:
 
 @law("inputs-kept", "arrays that it is given stay as they were")
 def _check_inputs_kept(subject: Subject) -> None:
-    task = make_exercise(subject)
-    copies = map_arrays(task.inputs, np.copy)
-    task.prepare()(*copies)
-    expect_same(copies, task.inputs, "inputs to stay as they were", name="input")
+    inputs, prepare = make_exercise(subject)
+    copies = map_arrays(inputs, np.copy)
+    prepare()(*copies)
+    expect_same(copies, inputs, "inputs to stay as they were", name="input")
 
 
 def _expect_same_from(subject: Subject, change: Callable[[NDArray[Any]], NDArray[Any]], kind: str) -> None:
-    task = make_exercise(subject)
-    wanted = task.prepare()(*map_arrays(task.inputs, np.copy))
-    got = task.prepare()(*map_arrays(task.inputs, change))
+    inputs, prepare = make_exercise(subject)
+    wanted = prepare()(*map_arrays(inputs, np.copy))
+    got = prepare()(*map_arrays(inputs, change))
     expect_same(got, wanted, f"the same result from {kind}", _SAME)
 
 
@@ -118,16 +118,16 @@ def _check_strided(subject: Subject) -> None:
 
 @law("deterministic", "equal inputs give equal results, without global random numbers")
 def _check_deterministic(subject: Subject) -> None:
-    task = make_exercise(subject)
+    inputs, prepare = make_exercise(subject)
     before = np.random.get_state()  # noqa: NPY002
     try:
         np.random.seed(1)  # noqa: NPY002
-        run = task.prepare()
-        first = map_arrays(run(*task.inputs), np.copy)
+        run = prepare()
+        first = map_arrays(run(*inputs), np.copy)
         np.random.seed(2)  # noqa: NPY002
         start = np.random.get_state()[1].tobytes()  # type: ignore[index]  # noqa: NPY002
-        expect_same(run(*task.inputs), first, "the same result when called again")
-        expect_same(task.prepare()(*task.inputs), first, "the same result when compiled again")
+        expect_same(run(*inputs), first, "the same result when called again")
+        expect_same(prepare()(*inputs), first, "the same result when compiled again")
         end = np.random.get_state()[1].tobytes()  # type: ignore[index]  # noqa: NPY002
         expect(start == end, "NumPy's global random numbers to stay untouched: take a Generator")
     finally:
@@ -141,12 +141,12 @@ def _check_results_owned(subject: Subject) -> None:
             array[...] = 0
         return array
 
-    task = make_exercise(subject)
-    run = task.prepare()
-    first = run(*task.inputs)
+    inputs, prepare = make_exercise(subject)
+    run = prepare()
+    first = run(*inputs)
     wanted = map_arrays(first, np.copy)
     map_arrays(first, clear)
-    expect_same(run(*task.inputs), wanted, "a result that is changed by the caller not to change the next")
+    expect_same(run(*inputs), wanted, "a result that is changed by the caller not to change the next")
 
 
 DESCRIPTION = (_check_defaults, _check_frozen, _check_descriptions, _check_json, _check_pickle)

@@ -112,7 +112,6 @@ class _Preamble(NamedTuple):
     on: _Level
     off_delay: _Level
     onset: _Level
-    quality: float
 
 
 @dataclass(frozen=True)
@@ -234,7 +233,7 @@ class BarkerSynchronizer:
         return SyncState(first_bin, counts, first_bin + lo, power, known, clock, stray), locks
 
     def _refine_peak(self, peak: _Peak) -> _Preamble:
-        first_bin, counts, lag, quality = peak
+        first_bin, counts, lag, _ = peak
         (off, off_noise), (on, on_noise) = self._fit_polarities(counts, lag)
         response = counts[1].take(lag + self._rise_steps, mode="clip")
         onset, onset_noise = _jackknife(_find_onsets(_leave_one_out(response)))
@@ -250,7 +249,6 @@ class BarkerSynchronizer:
             on=positive,
             off_delay=to_us(off, off_noise).after(positive),
             onset=to_us(lag - _CHIP_STEPS + onset, onset_noise).after(positive),
-            quality=quality,
         )
 
     def _fit_polarities(self, counts: Floats, lag: int) -> list[tuple[float, float]]:
@@ -277,16 +275,16 @@ class BarkerSynchronizer:
         peaks of a lamp are on no grid: only those that may be are refined.
         """
         if clock is None:
-            return self._start_clock(self._refine_peak(peak)), None
+            return self._start_clock(peak), None
         followed = self._follow_clock(clock, peak)
         if followed is not None:
             return followed, None
         if clock.preambles == 1 and peak.quality > clock.quality + _CLEAR_DIFFERENCE:
-            return self._start_clock(self._refine_peak(peak)), None
+            return self._start_clock(peak), None
         if peak.quality < clock.quality - _CLEAR_DIFFERENCE:
             return clock, stray
         if stray is not None and self._can_follow(self._peak_us(stray), 0.0, peak, 2):
-            followed = self._follow_clock(self._start_clock(self._refine_peak(stray)), peak)
+            followed = self._follow_clock(self._start_clock(stray), peak)
             if followed is not None:
                 return followed, None
         return clock, peak
@@ -303,7 +301,8 @@ class BarkerSynchronizer:
         off_us = abs(apart_us - packets * packet_us) - packets * self._max_drift_us
         return packets > 0 and off_us < (chips + _ON_GRID_CHIPS) * self._packet.chip_us
 
-    def _start_clock(self, found: _Preamble) -> _Clock:
+    def _start_clock(self, peak: _Peak) -> _Clock:
+        found = self._refine_peak(peak)
         return _Clock(
             packet=0,
             preambles=1,
@@ -315,7 +314,7 @@ class BarkerSynchronizer:
             if math.isnan(found.off_delay.value)
             else found.off_delay,
             onset=found.onset,
-            quality=found.quality,
+            quality=peak.quality,
         )
 
     def _predict(self, clock: _Clock, packets: int) -> tuple[float, float, float, float]:
@@ -353,7 +352,7 @@ class BarkerSynchronizer:
             variances=(time * noise / spread, both * noise / spread, rate - both**2 / spread),
             off_delay=clock.off_delay.update(found.off_delay, walk),
             onset=clock.onset.update(found.onset, walk),
-            quality=clock.quality + (found.quality - clock.quality) / preambles,
+            quality=clock.quality + (peak.quality - clock.quality) / preambles,
         )
 
     def _build_lock(self, clock: _Clock, quality: float) -> SyncLock:

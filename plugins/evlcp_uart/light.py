@@ -98,7 +98,8 @@ class Light:
             prior = np.tile(found, (2, 1, 1))
             found = (events + known[:, None, None] * prior) / (windows + known)[:, None, None]
         floor = _FLOOR * float(mean.mean()) + 1e-5
-        return _smooth_rates(found) + floor
+        padded = np.pad(found, ((0, 0), (0, 0), (len(_BLUR) // 2,) * 2), mode="edge")
+        return np.lib.stride_tricks.sliding_window_view(padded, len(_BLUR), 2) @ _BLUR + floor
 
     @cached_property
     def share(self) -> float:
@@ -249,8 +250,3 @@ def _normalize_likelihoods(logs: Floats) -> Floats:
     """Return likelihoods from their logarithms, the greatest of each window 1, float64 (n, C)."""
     likely: Floats = np.exp(logs - logs.max(1, initial=-np.inf, keepdims=True))
     return likely
-
-
-def _smooth_rates(rates: Floats) -> Floats:
-    padded = np.pad(rates, ((0, 0), (0, 0), (len(_BLUR) // 2,) * 2), mode="edge")
-    return np.lib.stride_tricks.sliding_window_view(padded, len(_BLUR), 2) @ _BLUR
