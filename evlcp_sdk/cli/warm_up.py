@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from evlcp_sdk.cli._common import Json, console, print_json, progress_bar
+
+_SCENE = ("duration_s=0.2", "motion.vib_rate_rad_s=0.3", "bars.payload=messages", "bars.text=warm")
+"""A short drive with so much vibration that every way of decoding is needed."""
 
 
 def warm_up(as_json: Json = False) -> None:
@@ -14,21 +20,46 @@ def warm_up(as_json: Json = False) -> None:
     In an image, before workers start:  [bold]evlcp warm-up[/]
     """
     from evlcp_sdk.formatting import format_count
-    from evlcp_sdk.warming import STEPS, warm_up as warm
 
     with progress_bar("compiling") as advance:
-        result = warm(lambda step: advance(STEPS.index(step), len(STEPS)))
+        result = compile_kernels(advance)
     if as_json:
         print_json(result)
         return
-    compiled, elapsed_s = result["compiled"], result["elapsed_s"]
-    if not compiled:
-        console().print(f"nothing to compile; tried in {elapsed_s:.1f} s")
+    if not result["compiled"]:
+        console().print(f"nothing to compile; tried in {result['elapsed_s']:.1f} s")
         return
-    console().print(f"{format_count(compiled, 'kernel')} compiled in {elapsed_s:.0f} s")
+    compiled = format_count(result["compiled"], "kernel")
+    console().print(f"{compiled} compiled in {result['elapsed_s']:.0f} s")
     if result["kept_in"] is None:
         console().print(
             "they cannot be kept, so each process compiles them again: give it a home, or a folder by"
             " NUMBA_CACHE_DIR",
             style="yellow",
         )
+
+
+def compile_kernels(advance: Callable[[int, int], None]) -> dict[str, Any]:
+    """Simulate and receive a fifth of a second with the default link; later processes find its kernels.
+
+    Returns:
+        How many kernels were compiled, the wall-clock time, s, and the folder that keeps them, or None.
+    """
+    import tempfile
+    import time
+    from pathlib import Path
+
+    from evlcp_sdk.kernels import count_compiled, find_cache_folder
+    from evlcp_sdk.run import receive_to_folder
+    from evlcp_sdk.simulated import simulate
+
+    compiled_before, start_s = count_compiled(), time.perf_counter()
+    with tempfile.TemporaryDirectory(prefix="evlcp-warm-up-") as name:
+        recording = Path(name) / "drive.raw"
+        advance(0, 2)
+        simulate("drive-30kmh", overrides=_SCENE).save(recording)
+        advance(1, 2)
+        receive_to_folder(recording, Path(name) / "out")
+    compiled, elapsed_s = count_compiled() - compiled_before, time.perf_counter() - start_s
+    folder = find_cache_folder()
+    return {"compiled": compiled, "elapsed_s": elapsed_s, "kept_in": None if folder is None else str(folder)}

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from evlcp_sdk.cli.warm_up import compile_kernels
 from evlcp_sdk.kernels import COMPILE_TIMER, njit
 from evlcp_sdk.stopwatch import Stopwatch
-from evlcp_sdk.warming import STEPS, warm_up
 from tests.conftest import ROOT
 
 OWN = """
@@ -113,11 +113,11 @@ def test_time_for_kernels_is_left_out() -> None:
 
 def test_a_warm_up_leaves_nothing_to_compile() -> None:
     """The first compiles what there is not; the second finds all of it."""
-    steps: list[str] = []
-    warmth = warm_up(steps.append)
-    assert tuple(steps) == STEPS
+    steps: list[tuple[int, int]] = []
+    warmth = compile_kernels(lambda *step: steps.append(step))
+    assert steps == [(0, 2), (1, 2)]
     assert warmth["kept_in"] is not None
-    assert warm_up()["compiled"] == 0
+    assert compile_kernels(lambda *_: None)["compiled"] == 0
 
 
 @pytest.mark.parametrize(
@@ -127,9 +127,11 @@ def test_a_warm_up_leaves_nothing_to_compile() -> None:
         (7, 31.0, "7 kernels compiled in 31 s they cannot be kept"),
     ],
 )
-def test_the_command_says_what_it_did(evlcp, monkeypatch, compiled, elapsed_s, words: str) -> None:
+def test_the_command_says_what_it_did(
+    evlcp, monkeypatch, compiled: int, elapsed_s: float, words: str
+) -> None:
     warmth = {"compiled": compiled, "elapsed_s": elapsed_s, "kept_in": None}
-    monkeypatch.setattr("evlcp_sdk.warming.warm_up", lambda advance: [advance(s) for s in STEPS] and warmth)
+    monkeypatch.setattr("evlcp_sdk.cli.warm_up.compile_kernels", lambda _: warmth)
     done = evlcp("warm-up")
     assert done.code == 0
     assert " ".join(done.out.split()).startswith(words)

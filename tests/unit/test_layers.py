@@ -13,7 +13,7 @@ ROWS = {
     "evlcp_sdk": (
         *("errors files formatting kernels lazy signals specs stopwatch", "air"),
         *("values scene clock utc _kernels", "plugin", "link", "io rx place sim", "diagnosis"),
-        *("results", "report", "study live", "run simulated surveying warming", "testing", "cli"),
+        *("results", "report", "study live", "run simulated surveying", "testing", "cli"),
     ),
     "evlcp_sdk/rx": (
         *("_kernels", "boxes distortion limits", "rhythm sweeps", "guard regions trust", "detector"),
