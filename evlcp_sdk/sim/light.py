@@ -366,13 +366,13 @@ def wiper_switches(wiper: WiperSpec, begin_us: float, end_us: float) -> tuple[Fl
         Times, us, float64 (n,); shares of the light from `begin_us` and from each of them on, float64 (n +
         1,).
     """
+    if not wiper.share:
+        return np.empty(0), np.ones(1)
     lowest = 1 - wiper.share
     steps = max(1, math.ceil(-math.log(lowest) / _WIPER_STEP_LN))
     # Step i falls as the line passes the geometric mean of its level and the one before.
     levels = lowest ** (np.arange(1, steps + 1) / steps)
-    fall_us = (
-        (1 - lowest ** ((np.arange(steps) + 0.5) / steps)) / max(wiper.share, 1e-12) * wiper.edge_s * 1e6
-    )
+    fall_us = (1 - lowest ** ((np.arange(steps) + 0.5) / steps)) / wiper.share * wiper.edge_s * 1e6
     once_us = np.concatenate([fall_us, wiper.lasts_s * 1e6 - fall_us[::-1]])
     once = np.concatenate([levels, np.append(1.0, levels[:-1])[::-1]])
     first_us, every_us = wiper.at_s * 1e6, wiper.every_s * 1e6

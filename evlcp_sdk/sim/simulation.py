@@ -16,7 +16,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.optics import Blur, edge_profile
 from evlcp_sdk.sim import _kernels
-from evlcp_sdk.sim.light import Source, background_switches, cut_changes, sources_of, wiper_switches
+from evlcp_sdk.sim.light import Source, background_switches, sources_of, wiper_switches
 from evlcp_sdk.sim.motion import CameraPath, project
 from evlcp_sdk.sim.optics import blur_of, tabulate_strip, undo_drops
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
@@ -36,7 +36,7 @@ MOTION_STEP_PX = 0.1
 _CELL_US = 1000.0
 _CELLS = 4
 _BLOCK_US = _CELLS * _CELL_US
-_STRETCH_BLOCKS = 8  # blocks
+_BLOCKS_AT_ONCE = 8
 _FAR_PX = (3.0, 6.0, 12.0)  # distances beyond each of which the motion step doubles
 _DEPTH_STEP = 0.0026  # of the depth
 _MAX_MOVES = 40
@@ -260,31 +260,6 @@ class _Footprint:
         return float(across), float(along)
 
 
-@dataclass(frozen=True, eq=False)
-class _Stretch:
-    """Motion and switching of the camera and the sources in some blocks of time.
-
-    Attributes:
-        begin_us: Its start.
-        end_us: Its end.
-        starts_us: Start of each pose, float64 (poses,).
-        attitude: Attitude of the camera in the middle of each pose, float64 (poses, 3), radians.
-        projections: Image points and depths of each source by pose; see `project`.
-        sent: Switching times and levels of each source; see `Source.switches`.
-        wiped: Those of the wiper; see `wiper_switches`.
-        changed: Those of the background; see `background_switches`.
-    """
-
-    begin_us: float
-    end_us: float
-    starts_us: Floats
-    attitude: Floats
-    projections: list[tuple[Floats, Floats]]
-    sent: list[tuple[Floats, Floats]]
-    wiped: tuple[Floats, Floats]
-    changed: tuple[Floats, Floats]
-
-
 _Block = tuple[_kernels.ActivePixels, tuple[Any, ...]]
 """The active pixels of a block of time, and the light on them, as arguments of `run_pixels`."""
 
@@ -360,8 +335,8 @@ class Simulation:
         self._wide_reach = max(halo.reach_px for halo in self._halos)
         self.counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
         self.done_s = 0.0
-        self._stretch: _Stretch | None = None
         self._footprints: dict[int, _Footprint] = {}
+        self._poses = self._sample_poses()
 
     def stream(self) -> Iterator[Events]:
         """Yield the events in order of time, in pieces of up to a block."""
@@ -450,6 +425,18 @@ class Simulation:
 
         return [partial(run, a, b) for a, b in pairwise(cuts) if a < b]
 
+    def _sample_poses(self) -> Iterator[tuple[Floats, ...]]:
+        """Yield each block's poses: starts, us, float64 (n,), and positions and attitudes, float64 (n, 3)."""
+        edges = np.append(np.arange(0.0, self.scene.duration_s * 1e6, _BLOCK_US), self.scene.duration_s * 1e6)
+        # Several blocks at once take less time; a pothole moves the image so fast that one has poses enough.
+        blocks = 1 if self.scene.motion.pothole_s else _BLOCKS_AT_ONCE
+        for first in range(0, len(edges) - 1, blocks):
+            part = edges[first : first + blocks + 1]
+            starts, middles = self._choose_poses(part[0], part[-1])
+            cuts = np.searchsorted(starts, part[1:-1])
+            columns = (starts, *self.path.sample(middles))
+            yield from zip(*(np.split(column, cuts) for column in columns), strict=True)
+
     def _choose_poses(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
         """Return starts and middles of poses, in which the image moves by one step, us, float64 (n,)."""
         cells = np.append(np.arange(begin_us, end_us, _CELL_US), end_us)
@@ -495,45 +482,22 @@ class Simulation:
         halos = [halo.cluster_shares(cuts_px) for halo in self._halos]
         return _Footprint(depth_m, blur, near, scale, z, light * across, light * along, halos)
 
-    def _get_stretch(self, begin_us: float) -> _Stretch:
-        if self._stretch is None or not self._stretch.begin_us <= begin_us < self._stretch.end_us:
-            # A pothole moves the image so fast that one block has poses enough.
-            blocks = 1 if self.scene.motion.pothole_s else _STRETCH_BLOCKS
-            end_us = min(begin_us + blocks * _BLOCK_US, self.scene.duration_s * 1e6)
-            starts, middles = self._choose_poses(begin_us, end_us)
-            position, attitude = self.path.sample(middles)
-            wiped = np.empty(0), np.ones(1)
-            if self.scene.wiper.share > 0:
-                wiped = wiper_switches(self.scene.wiper, begin_us, end_us)
-            self._stretch = _Stretch(
-                begin_us,
-                end_us,
-                starts,
-                attitude,
-                [self.project_source(source, position, attitude) for source in self._sources],
-                [source.switches(begin_us, end_us) for source in self._sources],
-                wiped,
-                background_switches(self.scene.background, begin_us, end_us),
-            )
-        return self._stretch
-
     def _prepare_block(self, number: int, begin_us: float, end_us: float) -> _Block | None:
         """Prepare a block: the sources' places and switching, and the pixels that they may excite."""
         scene = self.scene
-        camera, sensor, stretch = scene.camera, scene.sensor, self._get_stretch(begin_us)
-        of_block = slice(*np.searchsorted(stretch.starts_us, (begin_us, end_us)))
-        starts, attitude = stretch.starts_us[of_block], stretch.attitude[of_block]
+        camera, sensor = scene.camera, scene.sensor
+        starts, position, attitude = next(self._poses)
         turn = np.stack([attitude[:, 0], -attitude[:, 1]], 1) * camera.focal_px
-        wiped, changed = (cut_changes(*both, begin_us, end_us) for both in (stretch.wiped, stretch.changed))
+        wiped = wiper_switches(scene.wiper, begin_us, end_us)
+        changed = background_switches(scene.background, begin_us, end_us)
         lightest = float(wiped[1].max())
         light = np.append(sensor.dark_w_m2, scene.background.light_w_m2 * changed[1])
         darkest = float(light[0] + light[1:].min() * float(self._darkest_texture * wiped[1].min()))
-        shown: list[tuple[Source, tuple[Floats, Floats], Floats, Floats, Floats, Floats, _Footprint]] = []
+        shown: list[tuple[Source, Floats, Floats, Floats, Floats, _Footprint]] = []
         marked: list[NDArray[np.int64]] = []
         beyond: list[NDArray[np.uint8]] = []
         for i, source in enumerate(self._sources):
-            (places, depths), sent = stretch.projections[i], stretch.sent[i]
-            place, depth = places[of_block], depths[of_block]
+            place, depth = self.project_source(source, position, attitude)
             if depth.min() <= NEAREST_M:
                 continue
             middle_depth = depth.mean(1)
@@ -555,13 +519,13 @@ class Simulation:
             if len(lit):
                 marked.append(lit)
                 beyond.append(far)
-                shown.append((source, sent, place, strip_px, axis, bounds, footprint))
+                shown.append((source, place, strip_px, axis, bounds, footprint))
         around = scene.background.around_px
         if not shown and around < camera.width:
             return None
         pixels, masks, far = _merge_pixels(marked, beyond)
         if around > 0:
-            pixels, masks, far = self._add_background(pixels, masks, far, [one[2] for one in shown])
+            pixels, masks, far = self._add_background(pixels, masks, far, [place for _, place, *_ in shown])
 
         g, poses = len(shown), len(starts)
         most = max((source.clusters for source, *_ in shown), default=1)
@@ -573,7 +537,7 @@ class Simulation:
         switches: list[Floats] = []
         levels_of: list[Floats] = []
         halos_of: list[list[Floats]] = [[] for _ in self._halos]
-        for i, (source, sent, place, strip_px, along, cuts, footprint) in enumerate(shown):
+        for i, (source, place, strip_px, along, cuts, footprint) in enumerate(shown):
             k = source.clusters
             axis[:, i] = along.T
             origin[:, i] = place[:, 0].T
@@ -581,7 +545,7 @@ class Simulation:
             strips[i], clusters[i], gain[i] = strip_px, k, source.light_w_m2
             near_scale[i], near_reach[i] = footprint.scale_px, footprint.blur.reach_px
             tables[i] = footprint.near
-            when, levels = cut_changes(*sent, begin_us, end_us)
+            when, levels = source.switches(begin_us, end_us)
             switches.append(when)
             levels_of.append(levels)
             for lights, share in zip(halos_of, footprint.halos, strict=True):
