@@ -17,7 +17,7 @@ from pydantic import Field
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.formatting import suggest, to_toml_value
 from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.specs import SpecError, build_spec, read_toml
+from evlcp_sdk.specs import build_spec, read_toml
 
 _MIN_UPRIGHT = 0.1
 """Sine of a bar axis' elevation below which the bar counts as lying, so that its LEDs face horizontally."""
@@ -232,10 +232,7 @@ def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSit
     if not isinstance(rows, list) or not rows:
         lines = [f"{prefix}{key}: unknown table{suggest(key, ['bar'])}" for key in table if key != "bar"]
         raise ConfigError("\n".join([*lines, f"{prefix}bar: expected one [[bar]] or more"]))
-    try:
-        sites = build_spec(_SiteFile, table).bar
-    except SpecError as fault:
-        raise ConfigError("\n".join(fault.lines(prefix))) from fault
+    sites = build_spec(_SiteFile, table, prefix).bar
     faults = []
     for name in ("transmitter_id", "transmitter"):
         first: dict[int, int] = {}

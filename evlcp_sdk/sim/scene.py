@@ -25,7 +25,7 @@ from evlcp_sdk.link.resolve import Link, load_led_file, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.specs import SpecError, build_spec, parse_toml, parse_value, read_toml
+from evlcp_sdk.specs import build_spec, parse_toml, parse_value, read_toml
 
 MAX_PIXELS = 4096
 """Columns and rows of a sensor."""
@@ -547,12 +547,7 @@ def resolve_scene(
     for i, bar in enumerate(bars if isinstance(bars, list) else []):
         if isinstance(bar, dict) and isinstance(bar.get("link"), Mapping):
             _resolve_link(bar["link"], registry, f"{prefix}bars.{i}.link")
-    try:
-        scene = build_spec(Scene, table, hint=_hint_at_link)
-    except SpecError as refused:
-        raise ConfigError("\n".join(refused.lines(prefix))) from refused
-    except ConfigError as refused:
-        raise ConfigError(f"{prefix}{refused}") from refused
+    scene = build_spec(Scene, table, prefix, hint=_hint_at_link)
     if folder is not None:
         # File names are relative to the scene's own folder.
         path = scene.motion.path_file and str(folder / scene.motion.path_file)

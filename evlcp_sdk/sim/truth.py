@@ -128,7 +128,7 @@ def truth_from_table(
     try:
         found = validate_table(_TruthTable, table)
     except SpecError as refused:
-        raise InputError(f"{source}: not a scene's truth: {refused.lines()[0].strip()}") from refused
+        raise InputError(f"{source}: not a scene's truth: {str(refused).splitlines()[0]}") from refused
     t_us, n = np.array(found.t_s) * 1e6, len(found.t_s)
     if not n or (np.diff(t_us) <= 0).any():
         raise _make_error(source, "t_s", found.t_s, "rising times, one at the least")

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.formatting import to_toml_value
-from evlcp_sdk.specs import SpecError, build_spec, parse_value, read_toml
+from evlcp_sdk.specs import build_spec, parse_value, read_toml
 from evlcp_sdk.study.tally import Tally
 
 
@@ -230,10 +230,7 @@ def load_plan(
     table = read_toml(path)
     for override in overrides:
         _apply_override(table, override)
-    try:
-        file = build_spec(_File, table)
-    except SpecError as error:
-        raise ConfigError("\n".join(error.lines(f"{path}: "))) from error
+    file = build_spec(_File, table, f"{path}: ")
     folder = Path(path).parent
     faults: list[str] = []
     scenes = _make_cases("scene", file.scene, folder, scene_of, faults, path)

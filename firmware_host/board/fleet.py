@@ -113,17 +113,14 @@ def read_entries(path: Path) -> tuple[FleetEntry, ...]:
         ConfigError: The inventory cannot be read, or a value is wrong; the message names the place, the value
             and what was expected.
     """
-    try:
-        tables = build_spec(_Tables, read_toml(path))
-    except SpecError as fault:
-        raise ConfigError("\n".join(fault.lines(f"{path}: "))) from fault
+    tables = build_spec(_Tables, read_toml(path), f"{path}: ")
     entries = []
     for i, row in enumerate(tables.board):
         place = f"{path}: board[{i}]"
         try:
             entries.append(build_spec(FleetEntry, tables.defaults | row))
         except SpecError as fault:
-            raise ConfigError("\n".join(fault.lines(f"{place}."))) from fault
+            raise SpecError(fault.faults, f"{place}.") from fault
         except ConfigError as fault:
             raise ConfigError(f"{place}: {fault}") from fault
     for key in ("id", "port"):
