@@ -1,6 +1,7 @@
 """Calibration and survey: where a camera's lens and bars are, by recordings at known poses."""
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from evlcp_sdk.place.calibration import Calibration, CalibrationView, KnownPose,
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.navigator import Navigator, PositionPlan
 from evlcp_sdk.place.observations import BarView
-from evlcp_sdk.place.points import interpolate_points
+from evlcp_sdk.place.points import views_at
 from evlcp_sdk.place.survey import SurveyedBar, TrackPoses, survey_bars
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.run import receive
@@ -50,7 +51,7 @@ def calibrate(
     views: list[CalibrationView] = []
     for url in recordings:
         bars = BarRegistry(sites, link.position)
-        observed, _ = _observe_bars(url, poses, {"": link}, registry, bars, name)
+        observed = _observe_bars(url, poses, {"": link}, registry, bars, name)
         for contradiction in bars.contradictions.values():
             raise ConfigError(f"{url}: {contradiction}")
         for pose, views_of in observed:
@@ -98,8 +99,8 @@ def _observe_bars(
     registry: Registry | None,
     bars: BarRegistry,
     source: str,
-) -> tuple[list[tuple[KnownPose, dict[int, BarView]]], dict[int, str]]:
-    """The poses of a recording, each with the views of the transmitters; and the link of each transmitter.
+) -> list[tuple[KnownPose, dict[int, BarView]]]:
+    """The poses of a recording, each with the views of the transmitters.
 
     Raises:
         InputError: The recording cannot be read.
@@ -107,9 +108,7 @@ def _observe_bars(
     """
     poses = [pose for pose in poses if pose.recording in ("", Path(url).name)]
     placing = select_positioning_links(links)
-    periods = {name: one.packet.packet_chips * one.packet.chip_us for name, one in placing.items()}
-    frames: dict[int, list[Frame]] = {}
-    link_of: dict[int, str] = {}
+    frames = defaultdict[int, list[Frame]](list)
     first_us, last_us = math.inf, -math.inf
     with receive(url, list(links.values()), registry=registry) as packets:
         for packet in packets:
@@ -119,26 +118,15 @@ def _observe_bars(
             if packet.echo_of is not None:
                 frames.pop(packet.transmitter, None)
                 continue
-            link_of[packet.transmitter] = packet.link
-            kept = frames.setdefault(packet.transmitter, [])
-            clusters, period_us = placing[packet.link].bar.clusters, periods[packet.link]
+            link = placing[packet.link]
             for frame in packet.frames:
                 first_us, last_us = min(first_us, frame.t_us), max(last_us, frame.t_us)
-                if len(frame.points_px) == clusters and any(
-                    abs(frame.points_t_us - pose.t_us) <= period_us for pose in poses
+                if len(frame.points_px) == link.bar.clusters and any(
+                    abs(frame.points_t_us - pose.t_us) <= link.packet.packet_us for pose in poses
                 ):
-                    kept.append(frame)
-    observed: list[tuple[KnownPose, dict[int, BarView]]] = []
-    for pose in poses:
-        observed.append((pose, {}))
-        for number, kept in frames.items():
-            name = link_of[number]
-            link = placing[name]
-            errors = ErrorModel.of(link.position)
-            layout_m = link.bar.cluster_positions_m()
-            view = interpolate_points(number, kept, pose.t_us, periods[name], layout_m, errors)
-            if view is not None:
-                observed[-1][1][number] = view
+                    frames[packet.transmitter].append(frame)
+    errors = ErrorModel.of(next(iter(placing.values())).position)
+    observed = [(pose, views_at(pose.t_us, frames, placing, errors)) for pose in poses]
     times = [pose.t_us for pose in poses]
     in_view = any(views for _, views in observed) or any(first_us <= t <= last_us for t in times)
     if times and first_us <= last_us and not in_view:
@@ -146,7 +134,7 @@ def _observe_bars(
             f"{source}: t_us from {min(times):.16g} to {max(times):.16g}: expected the camera's clock, us,"
             f" which is at {first_us:.0f} to {last_us:.0f} where {url} shows bars"
         )
-    return observed, link_of
+    return observed
 
 
 def survey(
@@ -179,14 +167,14 @@ def survey(
     registries: list[BarRegistry] = []
     for url in recordings:
         registries.append(BarRegistry((), first_link.position))
-        observed, link_of = _observe_bars(url, poses, links, registry, registries[-1], name)
+        observed = _observe_bars(url, poses, links, registry, registries[-1], name)
         ids = registries[-1].ids
         for pose, views_of in observed:
             new = []
             for number, view in views_of.items():
                 if number not in ids or ids[number] in known_ids:
                     continue
-                id, by = ids[number], link_of[number]
+                id, by = ids[number], registries[-1].link_of(number)
                 if link_of_id.setdefault(id, by) != by:
                     raise ConfigError(
                         f"{url}: id {id} is sent by '{link_of_id[id]}' and '{by}': give one link at a time"

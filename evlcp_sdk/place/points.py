@@ -1,12 +1,13 @@
 """A bar's image points interpolated between frames, and its position in the camera's axes by one frame."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.error_model import DEFAULT_ERRORS, EXACT_CAMERA, ErrorModel
 from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -69,6 +70,20 @@ def _lagrange_weights(t: Floats) -> Floats:
     factors = -t[None] / np.where(differences == 0, 1.0, differences)
     np.fill_diagonal(factors, 1.0)
     return np.asarray(factors.prod(1))
+
+
+def views_at(
+    t_us: float, frames: Mapping[int, Sequence[Frame]], links: Mapping[str, Link], spec: ErrorModel
+) -> dict[int, BarView]:
+    """The bars that are seen at a time, by transmitter, from the frames of each, still without `enu_m`."""
+    views = {}
+    for number, kept in frames.items():
+        link = links[kept[0].link]
+        layout_m = link.bar.cluster_positions_m()
+        view = interpolate_points(number, kept, t_us, link.packet.packet_us, layout_m, spec)
+        if view is not None:
+            views[number] = view
+    return views
 
 
 def interpolate_points(

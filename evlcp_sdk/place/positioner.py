@@ -13,7 +13,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.bar_registry import BarRegistry
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView, Rejection
-from evlcp_sdk.place.points import interpolate_points
+from evlcp_sdk.place.points import views_at
 from evlcp_sdk.place.pose import search_focal_mm, solve_pose
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
@@ -40,6 +40,7 @@ class Positioner:
     Attributes:
         axes: The local axes; None as long as no place is known.
         bars: Where the transmitters stand.
+        frames_late: Frames so far that were too late for their own grid time.
     """
 
     def __init__(
@@ -59,12 +60,7 @@ class Positioner:
         self._frames: dict[int, list[Frame]] = {}
         self._next: int | None = None
         self._contradiction: tuple[list[BarView], Attitude | None] | None = None
-        self._counts = dict.fromkeys(("fixes", "refused", "frames_late"), 0)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Fixes given and refused, frames too late for theirs, forged beacons."""
-        return self._counts | {"beacons_forged": self.bars.forged}
+        self.frames_late = 0
 
     def search_focal_mm(self) -> float:
         """The focal length with which the first contradictory views fit, mm; NaN if there is none."""
@@ -91,7 +87,7 @@ class Positioner:
                 if self._next is None:
                     self._next = number
                 # A frame too late for its own grid time may still serve the next as a neighbour.
-                self._counts["frames_late"] += number < self._next
+                self.frames_late += number < self._next
                 self._frames.setdefault(packet.transmitter, []).append(frame)
             # A packet of another bar that starts half a packet after a fix is complete one packet later;
             # longer packets that are not yet complete have begun earlier than this one.
@@ -115,7 +111,6 @@ class Positioner:
             t_us = self._next * self._packet_us
             fix = self._compute_fix(t_us)
             if fix is not None:
-                self._counts["refused" if fix.refusal else "fixes"] += 1
                 fixes.append(fix)
             self._next += 1
             oldest = (self._next - 1) * self._packet_us
@@ -130,12 +125,7 @@ class Positioner:
     def _compute_fix(self, t_us: float) -> Fix | None:
         views, placed, unplaced = [], [], []
         bar_axes: LocalAxes | None = None
-        for number, frames in sorted(self._frames.items()):
-            link = self._links[self.bars.link_of(number)]
-            layout_m = link.bar.cluster_positions_m()
-            view = interpolate_points(number, frames, t_us, link.packet.packet_us, layout_m, self._spec)
-            if view is None:
-                continue
+        for number, view in sorted(views_at(t_us, self._frames, self._links, self._spec).items()):
             views.append(number)
             site = self.bars.site_of(number)
             if site is None:
@@ -144,6 +134,7 @@ class Positioner:
             bar_axes = bar_axes or LocalAxes.of([site])
             self.axes = self.axes or bar_axes
             try:
+                link = self._links[self.bars.link_of(number)]
                 enu = site.layout_positions_m(link.bar, bar_axes)
                 placed.append(replace(view, enu_m=enu, survey_sigmas=site.survey_sigmas))
             except ConfigError as error:
