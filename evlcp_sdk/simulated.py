@@ -7,6 +7,7 @@ from typing import Any
 
 from evlcp_sdk.errors import ConfigError, StreamError
 from evlcp_sdk.files import Outputs, check_output
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.io.open import open_writer
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.source import EventSource
@@ -97,8 +98,7 @@ class SimulatedSource(EventSource):
 
     def __repr__(self) -> str:
         scene = self.scene
-        number = len(scene.bars)
-        bars = f"{number} bar{'s' * (number != 1)}"
+        bars = format_count(len(scene.bars), "bar")
         return f"SimulatedSource({scene.name}, {bars}, {scene.duration_s:g} s, seed {scene.seed})"
 
 

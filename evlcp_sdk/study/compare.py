@@ -212,7 +212,7 @@ def _time_chunks(chunks: Iterator[Events], stopwatch: Stopwatch) -> Iterator[Eve
 def _warm_up(source: EventSource, variants: Sequence[Variant]) -> None:
     runs = [_VariantRun(variant.links) for variant in variants]
     packets = [link.packet for variant in variants for link in variant.links.values()]
-    enough_us = _WARM_PACKETS * max(packet.packet_chips * packet.chip_us for packet in packets)
+    enough_us = _WARM_PACKETS * max(packet.packet_us for packet in packets)
     first_us = None
     for events in source.chunks():
         first_us = int(events.t_us[0]) if first_us is None else first_us

@@ -92,12 +92,10 @@ class SentFrames:
         """Those of a bar; with `covers`, a frame that is hidden completely is not sent."""
         packet = bar.link.packet
         rate_hz = bar.rate_hz
-        numbers = range(packet.frames)
-        first = np.array([packet.frame_start_chip(f) for f in numbers], np.int64)
-        last = np.array([packet.frame_start_chip(f + 1) for f in numbers], np.int64)
+        starts = np.array(packet.frame_starts)
         packets = len(bar.symbols) if bar.sends_frames else 0
-        chip_numbers = (np.arange(packets)[:, None] * packet.packet_chips + first).ravel().astype(np.float64)
-        lengths = np.tile(last - first, packets)
+        chip_numbers = np.add.outer(np.arange(packets) * packet.packet_chips, starts[:-1]).ravel()
+        lengths = np.tile(np.diff(starts), packets)
         start_us: Floats = (chip_numbers - bar.start_chip) / rate_hz * 1e6
         end_us: Floats = start_us + lengths / rate_hz * 1e6
         clusters = bar.link.codebook.clusters

@@ -32,26 +32,22 @@ def tally_bar(sent: SentFrames, pairs: Iterable[tuple[FrameRow, int]]) -> list[t
     segments = [segment_of(at) for at in sent.distance_m.tolist()]
     tallies = [(segment, Tally(frames_sent=1)) for segment in segments]
     for frame, number in pairs:
-        bit_errors = visible = erased = hidden_count = claimed = 0
-        cut, hidden = sent.cut[number].tolist(), sent.hidden[number].tolist()
-        for k, sent_symbol in enumerate(sent.symbols[number].tolist()):
-            symbol = frame.symbols[k] if k < len(frame.symbols) else -1
-            if hidden[k]:
-                hidden_count += 1
-                claimed += symbol >= 0
-            elif not cut[k]:
-                visible += 1
-                erased += symbol < 0
-                bit_errors += (symbol ^ sent_symbol).bit_count() if symbol >= 0 else 0
+        sent_symbols = sent.symbols[number].tolist()
+        symbols = [*frame.symbols, *[-1] * len(sent_symbols)][: len(sent_symbols)]
+        given = np.array([symbol >= 0 for symbol in symbols])
+        visible, hidden = ~sent.cut[number], sent.hidden[number]
+        received = visible & given
+        errors = [symbols[k] ^ sent_symbols[k] for k in np.flatnonzero(received)]
+        erased = int((visible & ~given).sum())
         tally = Tally(
             frames_found=1,
-            bits=bits * (visible - erased),
-            bit_errors=bit_errors,
-            visible=visible,
+            bits=bits * int(received.sum()),
+            bit_errors=sum(error.bit_count() for error in errors),
+            visible=int(visible.sum()),
             erased=erased,
             erased_bits=bits * erased,
-            hidden=hidden_count,
-            claimed=claimed,
+            hidden=int(hidden.sum()),
+            claimed=int((hidden & given).sum()),
         )
         tallies.append((segments[number], tally))
         true_m = float(sent.distance_m[number])

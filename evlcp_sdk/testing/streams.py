@@ -116,7 +116,7 @@ def _check_clean(subject: Subject) -> None:
     sent = bar.symbols.reshape(-1, link.codebook.clusters)
     # The first packet starts with the recording, so that its first frame may be cut.
     expect(len(found) >= len(sent) - 1, f"{len(sent)} frames, or all but the first; got {len(found)}")
-    starts = np.array([link.packet.frame_start_chip(frame) for frame in range(link.packet.frames)])
+    starts = np.array(link.packet.frame_starts[:-1])
     for one in found:
         at = (one.t_us - bar.start_us) / link.packet.chip_us
         packet, chip = divmod(at + _TOLERANCE_CHIPS, link.packet.packet_chips)
@@ -134,7 +134,7 @@ def _check_bounded(subject: Subject) -> None:
     link, deframer = _compile_machine(subject)
     rng = np.random.default_rng(0)
     state, now_us, n = deframer.init(), 0, 500
-    step_us = max(_STEP_US, round(link.packet.packet_chips * link.packet.chip_us / 4))
+    step_us = max(_STEP_US, round(link.packet.packet_us / 4))
     for _ in range(40):
         t_us = np.sort(rng.integers(now_us, now_us + step_us, n))
         now_us += step_us
