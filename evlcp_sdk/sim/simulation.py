@@ -159,8 +159,7 @@ def _make_time_line(
     starts_us: Floats,
     wiped: tuple[Floats, Floats],
     changed_us: Floats,
-    switches: list[Floats],
-    levels_of: list[Floats],
+    sent: list[tuple[Floats, Floats]],
     halos_of: list[list[Floats]],
     most: int,
 ) -> tuple[_kernels.TimeLine, Floats, Floats]:
@@ -171,22 +170,21 @@ def _make_time_line(
         wiped: Times at which the share of all light that passes changes, float64 (n,), and the shares from
             the block's start on, float64 (n + 1,).
         changed_us: Times at which the background's light changes.
-        switches: Times at which each source switches, float64 (m,).
-        levels_of: Levels of its clusters, from the block's start on, float64 (m + 1, clusters).
-        halos_of: Its light in each halo on a grid, float64 (m + 1, places), halo by halo.
+        sent: Times of switching and levels of each source, see `Source.switches`, m of the former.
+        halos_of: Light of each source in each halo on a grid, float64 (m + 1, places), halo by halo.
         most: Most clusters of a source.
 
     Returns:
         The time line, the levels of `Strips`, and the light of `Halos`.
     """
-    sources = len(switches)
-    parts = [starts_us, wiped[0], changed_us, *switches]
+    sources = len(sent)
+    parts = [starts_us, wiped[0], changed_us, *(when for when, _ in sent)]
     when = np.concatenate(parts)
     # Kinds of entries: a pose, a step of the wiper or of the background, or a source that switches.
     kind = np.repeat([-2, -1, -3, *range(sources)], [len(part) for part in parts])
     order = np.argsort(when, kind="stable")
     when, kind = when[order], kind[order]
-    counts = [len(levels) for levels in levels_of]
+    counts = [len(shown) for _, shown in sent]
     row = np.cumsum(kind == np.arange(sources)[:, None], axis=1)
     row += np.cumsum([0, *counts])[:-1, None]
     levels = np.zeros((sum(counts), most))
@@ -194,7 +192,7 @@ def _make_time_line(
     halo = np.zeros((len(halos_of), sum(counts), places))
     begin = 0
     for i, count in enumerate(counts):
-        levels[begin : begin + count, : levels_of[i].shape[1]] = levels_of[i]
+        levels[begin : begin + count, : sent[i][1].shape[1]] = sent[i][1]
         for q, light in enumerate(halos_of):
             halo[q, begin : begin + count, : light[i].shape[1]] = light[i]
         begin += count
@@ -534,9 +532,6 @@ class Simulation:
         clusters, gain = np.empty(g, np.int64), np.empty(g)
         tables = np.empty((g, _NEAR_NODES + 1, 2 * _NEAR_NODES + 1))
         near_scale, near_reach = np.empty(g), np.empty(g)
-        switches: list[Floats] = []
-        levels_of: list[Floats] = []
-        halos_of: list[list[Floats]] = [[] for _ in self._halos]
         for i, (source, place, strip_px, along, cuts, footprint) in enumerate(shown):
             k = source.clusters
             axis[:, i] = along.T
@@ -545,12 +540,12 @@ class Simulation:
             strips[i], clusters[i], gain[i] = strip_px, k, source.light_w_m2
             near_scale[i], near_reach[i] = footprint.scale_px, footprint.blur.reach_px
             tables[i] = footprint.near
-            when, levels = source.switches(begin_us, end_us)
-            switches.append(when)
-            levels_of.append(levels)
-            for lights, share in zip(halos_of, footprint.halos, strict=True):
-                lights.append(levels @ share)
-        line, levels, halo = _make_time_line(starts, wiped, changed[0], switches, levels_of, halos_of, most)
+        sent = [source.switches(begin_us, end_us) for source, *_ in shown]
+        halos_of = [
+            [levels @ one[-1].halos[q] for one, (_, levels) in zip(shown, sent, strict=True)]
+            for q in range(len(self._halos))
+        ]
+        line, levels, halo = _make_time_line(starts, wiped, changed[0], sent, halos_of, most)
         world = (
             line,
             _kernels.Strips(levels, origin, axis, bounds, strips, clusters, gain),
