@@ -14,6 +14,7 @@ from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo, mak
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.errors import ConfigError, OutputError
+from evlcp_sdk.files import Outputs, check_output
 
 if TYPE_CHECKING:
     from evlcp_sdk.study.compare import Variant
@@ -77,8 +78,6 @@ def compare(
 
 
 def _check_outputs(out: Sequence[Path]) -> None:
-    from evlcp_sdk.files import check_output
-
     for path in out:
         if path.suffix not in (".csv", ".html", ".json"):
             raise typer.BadParameter(
@@ -151,8 +150,6 @@ def _compare_recording(url: str, *, variants: tuple[Variant, ...], in_process: b
 
 
 def _write(comparison: Comparison, paths: Sequence[Path]) -> None:
-    from evlcp_sdk.files import Outputs
-
     texts = {".csv": comparison.to_csv, ".html": comparison.to_html, ".json": comparison.to_json}
     with Outputs() as outputs:
         for path in paths:

@@ -12,6 +12,7 @@ import typer
 from evlcp_sdk.cli._campaign import print_faults, show_progress
 from evlcp_sdk.cli._common import Json, Workers, console, make_executor, print_json, progress_bar
 from evlcp_sdk.cli._tables import print_table
+from evlcp_sdk.files import Outputs, find_shipped_file, writing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,8 +27,6 @@ _WARM_UP_S = 0.06
 
 def demo_campaign() -> Path:
     """The demo's campaign: in the wheel, or in a checkout's `examples/campaigns`."""
-    from evlcp_sdk.files import find_shipped_file
-
     return find_shipped_file("campaigns", f"{CAMPAIGN_NAME}.toml")
 
 
@@ -53,7 +52,6 @@ def demo(
 
 
 def _simulate_drive(out: Path, workers: int | None, as_json: bool) -> None:
-    from evlcp_sdk.files import Outputs, writing
     from evlcp_sdk.report.drawing import save_plots
     from evlcp_sdk.study.collect import collect_results
     from evlcp_sdk.study.report import draw_charts, render_campaign
@@ -131,7 +129,6 @@ def print_drive(summary: Summary) -> None:
 
 def _decode_recording(out: Path, as_json: bool) -> None:
     from evlcp_sdk.cli._summary import print_summary
-    from evlcp_sdk.files import find_shipped_file
     from evlcp_sdk.run import receive_to_folder
     from evlcp_sdk.sim.truth import read_truth, truth_path
     from evlcp_sdk.study.frames import read_frames
