@@ -2,6 +2,7 @@
 
 import socket
 import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -11,7 +12,7 @@ from evlcp_sdk.io.interruptible import stream_until_stopped
 from evlcp_sdk.io.raw import RawEncoder, format_header
 from evlcp_sdk.live.publisher import Publisher, Subscription
 from evlcp_sdk.plugin.source import EventSource
-from evlcp_sdk.signals import Stopped
+from evlcp_sdk.signals import Stopped, never_stop
 
 _MAX_PIECES: Final = 2000
 """Pieces that may wait for a slow client: two seconds of a camera."""
@@ -49,8 +50,7 @@ class Sender:
         self._threads: list[threading.Thread] = []
         self._listening: list[socket.socket] = []
         self._connected = threading.Event()
-        self._closing = threading.Event()
-        self._unix = unix
+        self._unix: Path | None = None
         self.port = 0
         self.counts = {"events": 0, "listeners": 0, "pieces_dropped": 0}
         try:
@@ -59,16 +59,15 @@ class Sender:
                 self._listening.append(socket.create_server(tcp, family=family))
                 self.port = self._listening[-1].getsockname()[1]
             if unix is not None:
-                unix_socket = socket.socket(socket.AF_UNIX)
-                self._listening.append(unix_socket)
-                unix_socket.bind(str(unix))
-                unix_socket.listen()
+                self._listening.append(socket.socket(socket.AF_UNIX))
+                self._listening[-1].bind(str(unix))
+                self._unix = unix  # until then it may be another's file
+                self._listening[-1].listen()
         except OSError as fault:
             self.close()
             address = f"{tcp[0]}:{tcp[1]}" if tcp is not None and not self.port else str(unix)
             raise OutputError(f"{address}: cannot listen: {fault.strerror or fault}") from fault
         for one in self._listening:
-            one.settimeout(_POLL_S)
             self._start(self._accept, one)
 
     def wait(self, stopped: Stopped) -> bool:
@@ -78,7 +77,7 @@ class Sender:
                 return True
         return False
 
-    def run(self, stopped: Stopped = lambda: False) -> None:
+    def run(self, stopped: Stopped = never_stop) -> None:
         """Send the source to its end, or until stopped; return when all clients have got it.
 
         Raises:
@@ -91,20 +90,21 @@ class Sender:
                 if stopped():
                     break
         finally:
-            self._publisher.close()
-            self._closing.set()
+            self.close()
             for thread in self._threads:
                 thread.join(2 * _STALLED_S)
 
     def close(self) -> None:
-        """Disconnect all clients."""
-        self._closing.set()
+        """Listen no more, and disconnect clients when they have got the rest."""
         self._publisher.close()
         for one in self._listening:
+            # Closing alone does not end an `accept`.
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
             one.close()
-        if self._unix is not None and self._listening:
+        if self._unix is not None:
             self._unix.unlink(missing_ok=True)
-        self._listening = []
+        self._unix, self._listening = None, []
 
     def __enter__(self) -> "Sender":
         return self
@@ -118,17 +118,14 @@ class Sender:
         thread.start()
 
     def _accept(self, listening: socket.socket) -> None:
-        while not self._closing.is_set():
-            try:
+        # It ends when it is closed.
+        with suppress(OSError):
+            while True:
                 connection, _ = listening.accept()
-            except TimeoutError:
-                continue
-            except OSError:
-                return
-            subscription = self._publisher.subscribe({"events"}, most=_MAX_PIECES)
-            self.counts["listeners"] += 1
-            self._start(self._send, connection, subscription)
-            self._connected.set()
+                subscription = self._publisher.subscribe({"events"}, most=_MAX_PIECES)
+                self.counts["listeners"] += 1
+                self._start(self._send, connection, subscription)
+                self._connected.set()
 
     def _send(self, connection: socket.socket, subscription: Subscription) -> None:
         width, height = self._source.width or 1280, self._source.height or 720
