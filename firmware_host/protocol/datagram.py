@@ -84,7 +84,6 @@ class DatagramDecoder:
     """
 
     _partial: bytearray = field(default_factory=bytearray)
-    _is_skipping: bool = False
 
     def feed(self, data: bytes) -> list[Datagram]:
         """Take bytes from the wire; return the datagrams that they complete."""
@@ -92,13 +91,11 @@ class DatagramDecoder:
         *ended, rest = data.split(b"\0")
         for part in ended:
             self._partial += part
-            if self._partial and not self._is_skipping:
+            if self._partial:
                 with contextlib.suppress(DatagramError):
                     found.append(Datagram.decode(bytes(self._partial)))
             self._partial.clear()
-            self._is_skipping = False
         self._partial += rest
-        if len(self._partial) > MAX_WIRE_BYTES:
-            self._is_skipping = True
-            self._partial.clear()
+        # No datagram is so long, whatever else comes.
+        del self._partial[:-MAX_WIRE_BYTES]
         return found
