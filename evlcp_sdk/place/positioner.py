@@ -40,7 +40,6 @@ class Positioner:
     Attributes:
         axes: The local axes; None as long as no place is known.
         bars: Where the transmitters stand.
-        frames_late: Frames so far that were too late for their own grid time.
     """
 
     def __init__(
@@ -60,7 +59,12 @@ class Positioner:
         self._frames: dict[int, list[Frame]] = {}
         self._next: int | None = None
         self._contradiction: tuple[list[BarView], Attitude | None] | None = None
-        self.frames_late = 0
+        self._counts = dict.fromkeys(("fixes", "refused", "frames_late"), 0)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Fixes given and refused, frames too late for theirs, forged beacons."""
+        return self._counts | {"beacons_forged": self.bars.forged}
 
     def search_focal_mm(self) -> float:
         """The focal length with which the first contradictory views fit, mm; NaN if there is none."""
@@ -87,7 +91,7 @@ class Positioner:
                 if self._next is None:
                     self._next = number
                 # A frame too late for its own grid time may still serve the next as a neighbour.
-                self.frames_late += number < self._next
+                self._counts["frames_late"] += number < self._next
                 self._frames.setdefault(packet.transmitter, []).append(frame)
             # A packet of another bar that starts half a packet after a fix is complete one packet later;
             # longer packets that are not yet complete have begun earlier than this one.
@@ -111,6 +115,7 @@ class Positioner:
             t_us = self._next * self._packet_us
             fix = self._compute_fix(t_us)
             if fix is not None:
+                self._counts["refused" if fix.refusal else "fixes"] += 1
                 fixes.append(fix)
             self._next += 1
             oldest = (self._next - 1) * self._packet_us

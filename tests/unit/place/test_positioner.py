@@ -110,7 +110,7 @@ def test_bars_of_two_links_give_one_fix() -> None:
     assert_right(fixes)
     assert [fix.transmitters for fix in fixes] == [(0, 1)] * len(fixes)
     assert p.links_of(fixes[0]) == "long short"
-    assert p.frames_late == 0
+    assert p.counts["frames_late"] == 0
     # The longest packets make the grid.
     assert np.diff([fix.t_us for fix in fixes]) == pytest.approx(short.packet.packet_us)
     # The same fixes, packet by packet.
@@ -128,11 +128,12 @@ def test_one_bar_gives_a_fix_a_packet_time() -> None:
     fixes = fixes_of(unknown, packets_of(RIGHT, 3, 4))
     assert {(f.refusal, f.transmitters) for f in fixes} == {("no-site", (3,))}
     assert fixes[0].detail == "no site is known of transmitter 3 (id not received)"
+    assert unknown.counts["refused"] == len(fixes)
     p = positioner([LEFT])
     fixes = fixes_of(p, packets_of(LEFT, 0, 8))
     assert_right(fixes)
     assert [f.t_us for f in fixes] == [PACKET_US * n for n in range(1, 9)]
-    assert (p.frames_late, p.bars.forged) == (0, 0)
+    assert p.counts == {"fixes": 8, "refused": 0, "frames_late": 0, "beacons_forged": 0}
     assert (fixes[0].pitch_deg, fixes[0].roll_deg) == pytest.approx((4, 1))
     assert math.remainder(fixes[0].heading_deg, 360) == pytest.approx(0, abs=1e-6)
     assert not fixes[0].verified
@@ -219,7 +220,7 @@ def test_beacons_tell_who_and_where() -> None:
     # What is said in packet 4 counts for fixes that are not out yet.
     assert 1 <= len(given) <= 4
     assert {f.refusal for f in fixes[len(given) :]} == {"no-site"}
-    assert p.bars.forged == 1
+    assert p.counts["beacons_forged"] == 1
 
 
 @pytest.mark.parametrize(
