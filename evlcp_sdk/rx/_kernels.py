@@ -824,7 +824,9 @@ def measure_pilot_light(
                         both += agree[v * width + u]
                 total += weight * both
         out[k] = total / (edges * place) if place > 0 else 0.0
-    among, many = np.empty(clusters), 0
+    among = np.empty(clusters)
+    # A literal 0 would compile another median.
+    many: Any = np.int64(0)
     for k in range(clusters):
         among[many] = out[k]
         many += int(seen[k])
