@@ -281,10 +281,17 @@ def write_secret(data: bytes, path: Path) -> None:
     """
     if os.path.lexists(path):
         raise OutputError(f"{path}: exists; a key is not overwritten; --show prints it again")
-    with writing(path), Outputs() as outputs:
-        file = outputs.open_binary(path)
-        os.fchmod(file.fileno(), 0o600)
-        file.write(data)
+    with writing(path):
+        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        try:
+            with os.fdopen(number, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(number)
+            _sync(path.parent)
+        except BaseException:
+            path.unlink()
+            raise
 
 
 def read_secret(path: Path, max_bytes: int) -> bytes:
