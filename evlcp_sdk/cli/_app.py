@@ -7,16 +7,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from inspect import cleandoc
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import echo, log_on_stderr, silence_matplotlib
 from evlcp_sdk.formatting import escape_controls
-
-if TYPE_CHECKING:
-    from evlcp_sdk.plugin.registry import Registry
 
 HELP = """Read data and distance from blinking LEDs with an event camera.
 
@@ -106,7 +104,7 @@ def make_app(*modules: str) -> typer.Typer:
     return app
 
 
-def add_plugin_commands(app: typer.Typer, registry: "Registry") -> None:
+def add_plugin_commands(app: typer.Typer, registry: "sdk.registry.Registry") -> None:
     """Add the commands of plugins; a plugin whose commands cannot be built, or exist already, is left out."""
     known = _command_names(app)
     for plugin in registry.plugins_with_hook("evlcp_register_commands"):
@@ -192,10 +190,8 @@ def run() -> None:
             # Neither other commands nor plugins are needed, which take a tenth of a start.
             app = make_app(module)
         else:
-            from evlcp_sdk.plugin.registry import Registry
-
             app = make_app()
-            add_plugin_commands(app, Registry.load())
+            add_plugin_commands(app, sdk.registry.Registry.load())
         group = typer.main.get_group(app)
         _prepare_command(group)
         group()

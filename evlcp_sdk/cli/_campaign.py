@@ -1,17 +1,14 @@
 """The display of a running campaign: its progress, and the failed jobs."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._stderr import print_stderr
-
-if TYPE_CHECKING:
-    from evlcp_sdk.study.collect import Progress
 
 _MAX_FAULTS = 5
 
 
-def print_faults(progress: "Progress") -> None:
+def print_faults(progress: "sdk.collect.Progress") -> None:
     """Print the failed jobs, one line for equal faults."""
     lines = dict.fromkeys(fault.message for _, fault in progress.faults)
     for line in list(lines)[:_MAX_FAULTS]:
@@ -21,7 +18,7 @@ def print_faults(progress: "Progress") -> None:
         print_stderr(f"{len(lines) - _MAX_FAULTS} more kinds of failure")
 
 
-def show_progress(advance: Callable[..., None], progress: "Progress") -> None:
+def show_progress(advance: Callable[..., None], progress: "sdk.collect.Progress") -> None:
     """Advance a bar by tasks, with the errors so far."""
     failed = f", {len(progress.faults)} failed" if progress.faults else ""
     errors = f": {progress.bit_errors:,} errors in {progress.bits:,} bits" if progress.bits else ""

@@ -4,21 +4,19 @@ import json
 import logging
 import os
 import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.formatting import escape_controls
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
-
-    from evlcp_sdk.study.jobs import Executor
 
 LinkFile = Annotated[
     str | None, typer.Option("-c", "--config", metavar="link.toml", help="The link; all defaults without it.")
@@ -99,21 +97,19 @@ def console(*, stderr: bool = False) -> "Console":
     return screen
 
 
-def make_executor(workers: int | None, dask: str | None) -> "Executor":
+def make_executor(workers: int | None, dask: str | None) -> "sdk.jobs.Executor":
     """An executor on a Dask cluster, in processes (None: one per core), or in this one for 0.
 
     Raises:
         ConfigError: The cluster cannot be reached.
     """
-    from evlcp_sdk.study.jobs import DaskCluster, Inline, Processes
-
     if dask is not None:
         if workers is not None:
             raise typer.BadParameter("give one of --workers and --dask", param_hint="--dask")
-        return DaskCluster(dask)
+        return sdk.jobs.DaskCluster(dask)
     if workers == 0:
-        return Inline()
-    return Processes(workers or os.cpu_count() or 1)
+        return sdk.jobs.Inline()
+    return sdk.jobs.Processes(workers or os.cpu_count() or 1)
 
 
 @contextmanager

@@ -1,22 +1,18 @@
 """Groups of options of `receive`, `live` and `survey`."""
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import LinkFiles, Overrides, echo
 from evlcp_sdk.cli._stderr import print_stderr
-
-if TYPE_CHECKING:
-    from evlcp_sdk.link.resolve import Link
-    from evlcp_sdk.place.navigator import PositionPlan
-    from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-    from evlcp_sdk.utc import PulseClock
 
 
 def parse_utc(text: str) -> datetime:
@@ -39,15 +35,11 @@ class LinkOptions:
     link_files: LinkFiles = None
     overrides: Overrides = None
 
-    def load(self) -> "tuple[Link, ...]":
+    def load(self) -> "tuple[sdk.resolve.Link, ...]":
         """Load the links; warn on stderr of those that a receiver cannot distinguish."""
-        from evlcp_sdk.link.several import load_links, name_links
-
-        links = load_links(self.link_files, self.overrides or [])
+        links = sdk.several.load_links(self.link_files, self.overrides or [])
         if len(links) > 1:
-            from evlcp_sdk.diagnosis.light_checks import find_alike_links
-
-            for warning in find_alike_links(name_links(links)):
+            for warning in sdk.light_checks.find_alike_links(sdk.several.name_links(links)):
                 print_stderr(f"warning: {warning}")
         return links
 
@@ -82,12 +74,10 @@ class ResultOptions:
 
     def make_line_printer(self, recordings: Sequence[str]) -> "LinePrinter | None":
         """A printer of lines of JSON as they come; None without `--json-lines`."""
-        from evlcp_sdk.io.open import STDIN
-
         if self.json_lines is None:
             return None
         for is_wrong, reason in (
-            (self.json_lines != STDIN, f"{self.json_lines}: expected -, standard output"),
+            (self.json_lines != sdk.open.STDIN, f"{self.json_lines}: expected -, standard output"),
             (self.as_json, "end with the summary: give one of --json and --json-lines"),
             (len(recordings) > 1, "are those of one recording"),
         ):
@@ -97,13 +87,11 @@ class ResultOptions:
 
     def load_sink_names(self, *, positions: bool) -> tuple[str, ...]:
         """Names of the sinks in use, those with options of their own first, after a check that all load."""
-        from evlcp_sdk.plugin.records import choose_sinks
-        from evlcp_sdk.plugin.registry import Registry
-        from evlcp_sdk.results.sinks import load_sinks
-
         own_options = [name for name in ("figures", "report", "parquet", "mcap") if getattr(self, name)]
         names = tuple(dict.fromkeys([*own_options, *(self.sinks or [])]))
-        load_sinks(choose_sinks(Registry.load(), names, positions=positions))
+        sdk.sinks.load_sinks(
+            sdk.records.choose_sinks(sdk.registry.Registry.load(), names, positions=positions)
+        )
         if names and self.out is None:
             raise typer.BadParameter(
                 f"{', '.join(names)} goes into a folder: give -o OUT", param_hint="--out"
@@ -150,23 +138,20 @@ class PlaceOptions:
         ),
     ] = None
 
-    def plan(self, links: "Sequence[Link]", *, mcap: bool = False) -> "PositionPlan | None":
+    def plan(
+        self, links: "Sequence[sdk.resolve.Link]", *, mcap: bool = False
+    ) -> "sdk.navigator.PositionPlan | None":
         """The inputs of positions, for the links that allow them; None without sites."""
         if self.sites is None:
             for name, is_given in (("--mcap", mcap), ("--gnss", self.gnss is not None)):
                 if is_given:
                     raise typer.BadParameter("needs --sites", param_hint=name)
             return None
-        from evlcp_sdk.link.several import name_links, select_positioning_links
-        from evlcp_sdk.place.gnss import GnssLog
-        from evlcp_sdk.place.navigator import PositionPlan
-        from evlcp_sdk.scene.sites import load_sites
-
-        link = next(iter(select_positioning_links(name_links(links)).values()))
+        link = next(iter(sdk.several.select_positioning_links(sdk.several.name_links(links)).values()))
         log = None
         if self.gnss is not None:
-            log = GnssLog.read(self.gnss, self.clock_zero, link.position.gnss_sigma_m)
-        return PositionPlan(load_sites(self.sites), log)
+            log = sdk.gnss.GnssLog.read(self.gnss, self.clock_zero, link.position.gnss_sigma_m)
+        return sdk.navigator.PositionPlan(sdk.sites.load_sites(self.sites), log)
 
 
 @dataclass(frozen=True)
@@ -222,12 +207,8 @@ class CameraOptions:
         ),
     ] = None
 
-    def attitude(self, place: PlaceOptions) -> "Attitude | AttitudeLog | None":
+    def attitude(self, place: PlaceOptions) -> "sdk.attitude.Attitude | sdk.attitude.AttitudeLog | None":
         """The camera's known attitude; None where it is unknown."""
-        import math
-
-        from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-
         gravity_deg = self.gravity_sigma_deg
         if gravity_deg is None:
             # An IMU's samples follow a swaying camera; angles by hand hold for a whole drive.
@@ -248,14 +229,18 @@ class CameraOptions:
             if value is not None and not math.isfinite(value):
                 raise typer.BadParameter(f"{value}: expected a finite number", param_hint=name)
         if place.attitude_file is not None:
-            return AttitudeLog.read(place.attitude_file, Attitude(0.0, 0.0, None, *sigmas))
-        return Attitude(pitch, roll, heading, *sigmas) if pitch is not None and roll is not None else None
+            return sdk.attitude.AttitudeLog.read(
+                place.attitude_file, sdk.attitude.Attitude(0.0, 0.0, None, *sigmas)
+            )
+        return (
+            sdk.attitude.Attitude(pitch, roll, heading, *sigmas)
+            if pitch is not None and roll is not None
+            else None
+        )
 
-    def clock(self, place: PlaceOptions) -> "datetime | PulseClock | None":
+    def clock(self, place: PlaceOptions) -> "datetime | sdk.utc.PulseClock | None":
         """The UTC of a camera's clock: pulses of a recording, or that of its zero; None if unknown."""
-        from evlcp_sdk.utc import PulseClock
-
-        return place.clock_zero if self.pps is None else PulseClock(self.pps, place.clock_zero)
+        return place.clock_zero if self.pps is None else sdk.utc.PulseClock(self.pps, place.clock_zero)
 
 
 class LinePrinter:

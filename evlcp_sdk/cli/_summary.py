@@ -5,15 +5,15 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import console, print_json
+from evlcp_sdk.cli._receiving import LinePrinter
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.formatting import format_count
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-    from evlcp_sdk.cli._receiving import LinePrinter
 
 _MAX_MESSAGES, _MAX_CHARACTERS = 8, 200
 """Newest messages that are printed, and characters of each."""
@@ -36,8 +36,6 @@ def print_end(
 def print_summary(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) -> None:
     """Print what was found, received and lost, where the result is, and how fast it was."""
     from rich.text import Text
-
-    from evlcp_sdk.diagnosis.facts import Diagnostic
 
     out = console(stderr=stderr)
     recording, processing = summary["recording"], summary["processing"]
@@ -70,9 +68,9 @@ def print_summary(summary: dict[str, Any], folder: Path | None, *, stderr: bool 
             style="yellow",
         )
     for note in summary["notes"]:
-        out.print(str(Diagnostic(**note)), style="dim")
+        out.print(str(sdk.facts.Diagnostic(**note)), style="dim")
     for warning in summary["warnings"]:
-        out.print(f"warning: {Diagnostic(**warning)}", style="yellow")
+        out.print(f"warning: {sdk.facts.Diagnostic(**warning)}", style="yellow")
     if folder is not None:
         out.print(f"written: {folder}/{', '.join([*summary['files'], 'summary.json'])}", style="dim")
 

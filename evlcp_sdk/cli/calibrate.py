@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, print_json
 from evlcp_sdk.formatting import format_count
-
-if TYPE_CHECKING:
-    from evlcp_sdk.place.calibration import Calibration
 
 
 def calibrate(
@@ -42,15 +40,10 @@ def calibrate(
     position_sigma_m, heading_deg, pitch_deg, roll_deg, attitude_sigma_deg. What the views do not
     determine keeps its configured value, and is named.
     """
-    from evlcp_sdk import surveying
-    from evlcp_sdk.link.resolve import load_link
-    from evlcp_sdk.place.calibration import read_poses
-    from evlcp_sdk.scene.sites import load_sites
-
-    link = load_link(link_file, overrides or [])
-    bars = load_sites(sites)
-    known = read_poses(poses)
-    result = surveying.calibrate(recordings, bars, known, link, limit_px=limit_px, name=str(poses))
+    link = sdk.resolve.load_link(link_file, overrides or [])
+    bars = sdk.sites.load_sites(sites)
+    known = sdk.calibration.read_poses(poses)
+    result = sdk.surveying.calibrate(recordings, bars, known, link, limit_px=limit_px, name=str(poses))
     if as_json:
         print_json(
             {
@@ -68,7 +61,7 @@ def calibrate(
         console().print(_to_toml(result, len(known)))
 
 
-def _to_toml(result: Calibration, poses: int) -> str:
+def _to_toml(result: sdk.calibration.Calibration, poses: int) -> str:
     """The tables `[camera]` and `[camera_sigma]`; as comments what was not determined."""
     lines = [
         f"# {format_count(result.views, 'view')}, {format_count(result.points, 'point')},"

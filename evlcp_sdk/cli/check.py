@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, LinkFile, console, print_json
 from evlcp_sdk.errors import ConfigError
-
-if TYPE_CHECKING:
-    from evlcp_sdk.link.resolve import Link
-    from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.testing import Verdict
 
 _STYLES = {"ok": "green", "failed": "bold red", "skipped": "dim", "excused": "yellow"}
 
@@ -81,13 +77,10 @@ def _check_link(
     link_file: str | None, overrides: Sequence[str], *, as_json: bool
 ) -> tuple[str, dict[str, Any]]:
     """Check a link against its laws, and print each outcome at once; return its name and the JSON table."""
-    from evlcp_sdk.link.resolve import load_link
-    from evlcp_sdk.testing.suite import check_link
-
-    link = load_link(link_file, overrides)
+    link = sdk.resolve.load_link(link_file, overrides)
     ids = {role: link.table[role]["id"] for role in link.algorithms}
     laws: list[dict[str, str | None]] = []
-    for role, outcome in check_link(link):
+    for role, outcome in sdk.suite.check_link(link):
         id = ids.get(role)
         if not as_json:
             if not laws or laws[-1]["role"] != role:
@@ -107,11 +100,8 @@ def _check_algorithm(
     as_json: bool,
 ) -> tuple[str, dict[str, Any]]:
     """Check an algorithm against the laws of its role; return its name and the JSON table."""
-    from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.testing import check as hold, laws_of
-
-    laws_of(role)
-    registry = Registry.load()
+    sdk.testing.laws_of(role)
+    registry = sdk.registry.Registry.load()
     entry = registry.find(role, id)
     reasons = {}
     for text in excuses:
@@ -120,7 +110,7 @@ def _check_algorithm(
             raise ConfigError(f"--excuse {text}: expected LAW=REASON")
         reasons[law.strip()] = reason.strip()
     link = _build_link(role, id, link_file, overrides, registry)
-    outcomes = hold(role, link.algorithm(role), reasons, link)
+    outcomes = sdk.testing.check(role, link.algorithm(role), reasons, link)
     if not as_json:
         _print_outcomes(outcomes, max(len(o.law.name) for o in outcomes))
     table = {
@@ -135,19 +125,14 @@ def _check_algorithm(
     return f"{role} '{id}' of {entry.distribution} {entry.version}", table
 
 
-def _describe_outcome(outcome: Verdict) -> dict[str, str]:
+def _describe_outcome(outcome: sdk.testing.Verdict) -> dict[str, str]:
     law = outcome.law
     return {"law": law.name, "says": law.statement, "status": outcome.status, "detail": outcome.detail}
 
 
 def _build_link(
-    role: str, id: str, link_file: str | None, overrides: Sequence[str], registry: Registry
-) -> Link:
-    from evlcp_sdk.link.resolve import load_link, resolve
-    from evlcp_sdk.plugin.roles import STEPS
-    from evlcp_sdk.specs import parse_value
-    from evlcp_sdk.testing.exercises import ONE_CLUSTER
-
+    role: str, id: str, link_file: str | None, overrides: Sequence[str], registry: sdk.registry.Registry
+) -> sdk.resolve.Link:
     own: dict[str, object] = {}
     rest = []
     for override in overrides:
@@ -156,10 +141,10 @@ def _build_link(
         if not (equals and key) or (dot and not table):
             raise ConfigError(f"--set {override}: expected KEY=VALUE or TABLE.KEY=VALUE")
         if not dot or table == role:
-            own[key] = parse_value(value)
+            own[key] = sdk.specs.parse_value(value)
         else:
             rest.append(override)
-    link = load_link(link_file, rest, registry)
+    link = sdk.resolve.load_link(link_file, rest, registry)
     # Parameters in the file belong to the algorithm that the file selects.
     keys = link.table.get(role, {"id": id})
     keys = keys if keys["id"] == id else {"id": id}
@@ -167,16 +152,16 @@ def _build_link(
     overridden = frozenset((role, key) for key in own)
     if role == "framing" and link.table[role]["id"] != id:
         # Another framing's steps are not its own, and the default bar may not suit it.
-        tables = {name: values for name, values in tables.items() if name not in STEPS}
+        tables = {name: values for name, values in tables.items() if name not in sdk.roles.STEPS}
         if link_file is None and not any(name.startswith("bar.") for name in rest):
             try:
-                return resolve(tables, registry, overridden=overridden)
+                return sdk.resolve.resolve(tables, registry, overridden=overridden)
             except ConfigError:
-                tables["bar"] = dict(ONE_CLUSTER)
-    return resolve(tables, registry, source=link_file or "", overridden=overridden)
+                tables["bar"] = dict(sdk.exercises.ONE_CLUSTER)
+    return sdk.resolve.resolve(tables, registry, source=link_file or "", overridden=overridden)
 
 
-def _print_outcomes(outcomes: Sequence[Verdict], width: int) -> None:
+def _print_outcomes(outcomes: Sequence[sdk.testing.Verdict], width: int) -> None:
     from rich.text import Text
 
     out = console()

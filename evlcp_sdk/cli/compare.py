@@ -6,19 +6,15 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo, make_executor, progress_bar
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.errors import ConfigError, OutputError
-from evlcp_sdk.files import Outputs, check_output
-
-if TYPE_CHECKING:
-    from evlcp_sdk.study.compare import Variant
-    from evlcp_sdk.study.comparison import Comparison, Table
 
 _SQLITE = b"SQLite format 3\0"
 
@@ -85,7 +81,7 @@ def _check_outputs(out: Sequence[Path]) -> None:
             )
         if not path.parent.is_dir():
             raise OutputError(f"{path}: cannot be written: no folder {path.parent}")
-        check_output(path, regular=False)
+        sdk.files.check_output(path, regular=False)
 
 
 def _is_campaign(url: str) -> bool:
@@ -104,13 +100,9 @@ def _is_campaign(url: str) -> bool:
         return False
 
 
-def _load_comparison(path: Path) -> Comparison:
-    from evlcp_sdk.study.comparison import compare_links
-    from evlcp_sdk.study.store import Store
-    from evlcp_sdk.study.summary import summarize
-
-    with Store(path) as store:
-        return compare_links(summarize(store))
+def _load_comparison(path: Path) -> sdk.comparison.Comparison:
+    with sdk.store.Store(path) as store:
+        return sdk.comparison.compare_links(sdk.summary.summarize(store))
 
 
 def _compare_recordings(
@@ -119,18 +111,15 @@ def _compare_recordings(
     link_files: Sequence[str] | None,
     overrides: Sequence[str],
     workers: int,
-) -> tuple[int, Comparison]:
-    from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.study.compare import comparison_of, load_variants
-
+) -> tuple[int, sdk.comparison.Comparison]:
     if not texts:
         raise typer.BadParameter("name at least one, e.g. --variant paper:", param_hint="--variant")
     if duplicates := {url for url in urls if urls.count(url) > 1}:
         raise typer.BadParameter(f"{min(duplicates)} is named twice", param_hint="REC...")
-    variants = load_variants(texts, link_files, overrides)
+    variants = sdk.compare.load_variants(texts, link_files, overrides)
     in_process = not workers or len(urls) == 1
     executor = make_executor(0 if in_process else workers, None)
-    tables: dict[str, Table] = {}
+    tables: dict[str, sdk.comparison.Table] = {}
     code = 0
     for outcome in executor.run(partial(_compare_recording, variants=variants, in_process=in_process), urls):
         if outcome.value is not None:
@@ -139,32 +128,35 @@ def _compare_recordings(
             print_stderr(outcome.fault.message)
             code = max(code, outcome.fault.exit_code)
     ordered = [tables[url] for url in urls if url in tables]
-    return code, comparison_of(ordered, variants, Registry.load().versions())
+    return code, sdk.compare.comparison_of(ordered, variants, sdk.registry.Registry.load().versions())
 
 
-def _compare_recording(url: str, *, variants: tuple[Variant, ...], in_process: bool) -> Table:
-    from evlcp_sdk.study.compare import compare_recording
-
+def _compare_recording(
+    url: str, *, variants: tuple[sdk.compare.Variant, ...], in_process: bool
+) -> sdk.comparison.Table:
     with progress_bar(Path(url).name, by_bytes=True) if in_process else nullcontext() as advance:
-        return compare_recording(url, variants, advance=advance or (lambda _done, _of: None))
+        return sdk.compare.compare_recording(url, variants, advance=advance or (lambda _done, _of: None))
 
 
-def _write(comparison: Comparison, paths: Sequence[Path]) -> None:
+def _write(comparison: sdk.comparison.Comparison, paths: Sequence[Path]) -> None:
     texts = {".csv": comparison.to_csv, ".html": comparison.to_html, ".json": comparison.to_json}
-    with Outputs() as outputs:
+    with sdk.files.Outputs() as outputs:
         for path in paths:
             outputs.write_text(texts[path.suffix](), path)
 
 
-def _print_comparison(comparison: Comparison, paths: Sequence[Path]) -> None:
-    from evlcp_sdk.study.comparison import MARK
-
+def _print_comparison(comparison: sdk.comparison.Comparison, paths: Sequence[Path]) -> None:
     out = console()
     for one in comparison.tables:
         out.print(one.name, style="bold")
         head, lines = one.format_rows()
         # The best end with a mark.
-        print_table(out, head, [[t if best else f"{t} " for t, best in line] for line in lines], best=MARK)
+        print_table(
+            out,
+            head,
+            [[t if best else f"{t} " for t, best in line] for line in lines],
+            best=sdk.comparison.MARK,
+        )
         out.print()
     for note in comparison.notes:
         out.print(note, style="yellow")

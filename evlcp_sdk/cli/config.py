@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, echo, print_json
 
 
@@ -25,20 +26,15 @@ def config(
     See what a change does:    [bold]evlcp config -c link.toml --set modulation.id=wh8 --digest[/]
     Codes for the transmitter: [bold]evlcp config --codebook c > codebook.h[/]
     """
-    from evlcp_sdk.link.resolve import load_link
-    from evlcp_sdk.link.text import to_toml
-    from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.rx.receiver import Receiver
-
     if digest + as_json + (codebook is not None) > 1:
         raise typer.BadParameter("give one of --digest, --json and --codebook", param_hint="--json")
-    registry = Registry.load()
-    link = load_link(link_file, overrides or [], registry)
+    registry = sdk.registry.Registry.load()
+    link = sdk.resolve.load_link(link_file, overrides or [], registry)
     if codebook is not None:
         echo(link.codebook.to_json() if codebook == "json" else link.codebook.to_c())
         return
     # A receiver compiles its algorithms, so that what they refuse is reported here.
-    Receiver(link)
+    sdk.receiver.Receiver(link)
     if digest:
         echo(link.digest)
     elif as_json:
@@ -50,4 +46,4 @@ def config(
         }
         print_json(table, 2)
     else:
-        echo(to_toml(link, registry), nl=False)
+        echo(sdk.text.to_toml(link, registry), nl=False)

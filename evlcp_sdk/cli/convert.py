@@ -7,9 +7,12 @@ from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, echo, print_json, progress_bar
 from evlcp_sdk.cli._stderr import print_stderr
+from evlcp_sdk.errors import InputError, UnpluggedError
 from evlcp_sdk.formatting import format_count
+from evlcp_sdk.signals import stop_on_request
 
 
 def convert(
@@ -37,19 +40,14 @@ def convert(
     From HDF5:                [bold]evlcp convert REC.hdf5 --size 1280x720 -o REC.raw[/]
     A camera, until Ctrl-C:   [bold]evlcp convert camera: -o REC.raw[/]
     """
-    from evlcp_sdk.errors import InputError, UnpluggedError
-    from evlcp_sdk.io.urls import parse_size
-    from evlcp_sdk.run import convert as run_convert
-    from evlcp_sdk.signals import stop_on_request
-
     sensor_size = None
     if size is not None:
         try:
-            sensor_size = parse_size(size)
+            sensor_size = sdk.urls.parse_size(size)
         except ValueError as fault:
             raise typer.BadParameter(f"{size!r}: expected {fault}", param_hint="--size") from fault
     with stop_on_request() as stopped, progress_bar(Path(url).name, by_bytes=True) as advance:
-        result = run_convert(url, out, size=sensor_size, format=format, advance=advance, stopped=stopped)
+        result = sdk.run.convert(url, out, size=sensor_size, format=format, advance=advance, stopped=stopped)
     if as_json:
         print_json({"out": str(out)} | result)
     else:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._campaign import print_faults, show_progress
 from evlcp_sdk.cli._common import Json, Workers, console, make_executor, print_json, progress_bar
+from evlcp_sdk.cli._summary import print_summary
 from evlcp_sdk.cli._tables import print_table
-from evlcp_sdk.files import Outputs, find_shipped_file, writing
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from evlcp_sdk.study.summary import Summary
 
 CAMPAIGN_NAME = "demo"
 
@@ -27,7 +25,7 @@ _WARM_UP_S = 0.06
 
 def demo_campaign() -> Path:
     """The demo's campaign: in the wheel, or in a checkout's `examples/campaigns`."""
-    return find_shipped_file("campaigns", f"{CAMPAIGN_NAME}.toml")
+    return sdk.files.find_shipped_file("campaigns", f"{CAMPAIGN_NAME}.toml")
 
 
 def demo(
@@ -52,36 +50,29 @@ def demo(
 
 
 def _simulate_drive(out: Path, workers: int | None, as_json: bool) -> None:
-    from evlcp_sdk.report.drawing import save_plots
-    from evlcp_sdk.study.collect import collect_results
-    from evlcp_sdk.study.report import draw_charts, render_campaign
-    from evlcp_sdk.study.store import Store
-    from evlcp_sdk.study.summary import summarize
-    from evlcp_sdk.study.task import plan_campaign, run_job
-
-    plan = plan_campaign(demo_campaign())
+    plan = sdk.task.plan_campaign(demo_campaign())
     if not as_json:
         console().print(f"simulating and receiving {len(plan.jobs)} stretches of a drive ...", style="dim")
-    with writing(out):
+    with sdk.files.writing(out):
         out.mkdir(parents=True, exist_ok=True)
     results = out / f"{CAMPAIGN_NAME}.sqlite"
     for name in (results, *(results.with_name(results.name + end) for end in ("-wal", "-shm"))):
         name.unlink(missing_ok=True)
-    with Store(results, create=True) as store:
+    with sdk.store.Store(results, create=True) as store:
         with progress_bar(plan.name) as advance:
             # Compile here, once and visibly, rather than in each worker.
             job = plan.jobs[0]
-            run_job(replace(job, scene=replace(job.scene, duration_s=_WARM_UP_S)))
-            progress = collect_results(
-                plan, store, make_executor(workers, None), run_job, partial(show_progress, advance)
+            sdk.task.run_job(replace(job, scene=replace(job.scene, duration_s=_WARM_UP_S)))
+            progress = sdk.collect.collect_results(
+                plan, store, make_executor(workers, None), sdk.task.run_job, partial(show_progress, advance)
             )
-        summary = summarize(store)
+        summary = sdk.summary.summarize(store)
     print_faults(progress)
     if progress.faults:
         raise typer.Exit(max(fault.exit_code for _, fault in progress.faults))
-    with Outputs() as outputs:
-        save_plots(draw_charts(summary), summary.plan.name, out, outputs)
-        outputs.write_text(render_campaign(summary), out / "report.html")
+    with sdk.files.Outputs() as outputs:
+        sdk.drawing.save_plots(sdk.report.draw_charts(summary), summary.plan.name, out, outputs)
+        outputs.write_text(sdk.report.render_campaign(summary), out / "report.html")
     if as_json:
         print_json(summary.to_dict())
         return
@@ -91,29 +82,28 @@ def _simulate_drive(out: Path, workers: int | None, as_json: bool) -> None:
     )
 
 
-def print_drive(summary: Summary) -> None:
+def print_drive(summary: sdk.summary.Summary) -> None:
     """Print bits, BER with 95 % confidence and RMSE of each segment of distance, and the paper's."""
-    from evlcp_sdk.study.intervals import measure_figure
-    from evlcp_sdk.study.summary import compare_with_paper
-    from evlcp_sdk.study.tally import SEGMENT_M, Tally
-
     (series,) = summary.series
     paper = {
         (c.reference.measure, begin): (
             f"{'≤ ' if c.reference.bound else ''}{c.reference.value:g}",
             "as good" if c.verdict == "agrees" else c.verdict,
         )
-        for c in compare_with_paper([series])
-        for begin in range(c.reference.from_m, c.reference.to_m, SEGMENT_M)
+        for c in sdk.summary.compare_with_paper([series])
+        for begin in range(c.reference.from_m, c.reference.to_m, sdk.tally.SEGMENT_M)
     }
     rows = []
     for begin, recordings in reversed(series.segments):
-        tally = Tally.sum(recordings)
-        ber, rmse = measure_figure(recordings, "ber"), measure_figure(recordings, "rmse_m")
+        tally = sdk.tally.Tally.sum(recordings)
+        ber, rmse = (
+            sdk.intervals.measure_figure(recordings, "ber"),
+            sdk.intervals.measure_figure(recordings, "rmse_m"),
+        )
         bits, metres = (paper.get((kind, begin), ("-", "-")) for kind in ("ber", "rmse_m"))
         rows.append(
             (
-                f"{begin} to {begin + SEGMENT_M} m",
+                f"{begin} to {begin + sdk.tally.SEGMENT_M} m",
                 f"{tally.frames_found} of {tally.frames_sent}",
                 f"{tally.bit_errors} of {tally.bits}",
                 f"≤ {ber.high:.2g}" if ber.count else "-",
@@ -128,19 +118,15 @@ def print_drive(summary: Summary) -> None:
 
 
 def _decode_recording(out: Path, as_json: bool) -> None:
-    from evlcp_sdk.cli._summary import print_summary
-    from evlcp_sdk.run import receive_to_folder
-    from evlcp_sdk.sim.truth import read_truth, truth_path
-    from evlcp_sdk.study.frames import read_frames
-    from evlcp_sdk.study.score import score_frames
-
     # In the wheel, or in a checkout's examples/recordings.
-    recording = find_shipped_file("recordings", "night-50m-30kmh-cut.raw")
+    recording = sdk.files.find_shipped_file("recordings", "night-50m-30kmh-cut.raw")
     if not as_json:
         console().print(f"decoding {recording.name} ...", style="dim")
-    summary = receive_to_folder(recording, out, sinks=["figures"])
+    summary = sdk.run.receive_to_folder(recording, out, sinks=["figures"])
     # The written rows, as `evlcp score` reads them.
-    score = score_frames(read_frames(out), read_truth(truth_path(recording)))
+    score = sdk.score.score_frames(
+        sdk.frames.read_frames(out), sdk.truth.read_truth(sdk.truth.truth_path(recording))
+    )
     if as_json:
         print_json(summary | {"score": score})
         return
@@ -159,8 +145,6 @@ def _print_score(score: Mapping[str, Any]) -> None:
 
 
 def _print_frames(file: Path) -> None:
-    import csv
-
     rows = []
     with file.open(newline="") as lines:
         for row in csv.DictReader(lines):

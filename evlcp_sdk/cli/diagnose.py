@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, print_json, progress_bar
 from evlcp_sdk.cli._tables import print_table
-
-if TYPE_CHECKING:
-    from evlcp_sdk.diagnosis.diagnose import Diagnosis
 
 
 def diagnose(
@@ -33,18 +31,12 @@ def diagnose(
     fails, other chip rates, modulations and lengths of a packet are tried, and characters of one LED of any
     rate and format. Ends with 0 whatever is wrong.
     """
-    from evlcp_sdk.diagnosis.diagnose import diagnose as run
-    from evlcp_sdk.files import Outputs
-    from evlcp_sdk.link.resolve import load_link
-
-    link = load_link(link_file, overrides or [])
+    link = sdk.resolve.load_link(link_file, overrides or [])
     with progress_bar(Path(recording).name, by_bytes=True) as advance:
-        diagnosis = run(recording, link, advance=advance)
+        diagnosis = sdk.diagnose.diagnose(recording, link, advance=advance)
     if out is not None:
-        from evlcp_sdk.report.diagnosis_page import render_diagnosis
-
-        with Outputs() as outputs:
-            outputs.write_text(render_diagnosis(diagnosis), out)
+        with sdk.files.Outputs() as outputs:
+            outputs.write_text(sdk.diagnosis_page.render_diagnosis(diagnosis), out)
     if as_json:
         print_json(diagnosis.to_dict())
         return
@@ -62,7 +54,7 @@ _STYLES = {
 }
 
 
-def _print_diagnosis(diagnosis: Diagnosis) -> None:
+def _print_diagnosis(diagnosis: sdk.diagnose.Diagnosis) -> None:
     from rich.table import Table
     from rich.text import Text
 

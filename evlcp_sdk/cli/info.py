@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, echo, print_json
 
 
@@ -17,11 +18,10 @@ def info(
 
     Reads it once from front to back and decodes no light: [bold]evlcp info REC.raw[/]
     """
-    from evlcp_sdk.io.describe import describe_source
-    from evlcp_sdk.io.open import STDIN, open_source
-
-    with open_source(recording) as source:
-        table = describe_source(source, str(source.path) if recording == STDIN else recording)
+    with sdk.open.open_source(recording) as source:
+        table = sdk.describe.describe_source(
+            source, str(source.path) if recording == sdk.open.STDIN else recording
+        )
     if as_json:
         print_json(table, 2)
     else:
@@ -29,8 +29,6 @@ def info(
 
 
 def _format_table(table: dict[str, Any]) -> str:
-    from evlcp_sdk.io.describe import RATE_WINDOW_US
-
     size = "" if table["bytes"] is None else f", {table['bytes']:,} bytes"
     sensor = "of unknown size" if table["width"] is None else f"{table['width']} x {table['height']}"
     rows = {
@@ -47,7 +45,7 @@ def _format_table(table: dict[str, Any]) -> str:
         rows["events"] = [f"{table['counts']['events']:,}, {table['positive_share']:.0%} positive"]
         mean = "-" if table["events_per_s"] is None else f"{table['events_per_s'] / 1e6:.3f}"
         peak = f"{table['peak_events_per_s'] / 1e6:.3f}"
-        rows["rate"] = [f"{mean} Mev/s, at most {peak} Mev/s over {RATE_WINDOW_US / 1e3:.0f} ms"]
+        rows["rate"] = [f"{mean} Mev/s, at most {peak} Mev/s over {sdk.describe.RATE_WINDOW_US / 1e3:.0f} ms"]
     triggers = [f"channel {t['channel']} {t['edge']}: {t['count']:,}" for t in table["triggers"]]
     rows |= {"triggers": triggers or ["none"], "anomalies": table["anomalies"] or ["none"]}
     lines = ((name if not i else "", text) for name, texts in rows.items() for i, text in enumerate(texts))

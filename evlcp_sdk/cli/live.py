@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import console
 from evlcp_sdk.cli._receiving import CameraOptions, Cores, LinkOptions, PlaceOptions, ResultOptions
@@ -17,15 +19,6 @@ from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.cli._summary import format_delays, print_end
 from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
 from evlcp_sdk.signals import stop_on_request
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from evlcp_sdk.link.resolve import Link
-    from evlcp_sdk.live.loop import LiveStatus
-    from evlcp_sdk.live.publisher import Publisher
-    from evlcp_sdk.place.navigator import PositionPlan
-    from evlcp_sdk.utc import ClockZero
 
 _HERE = "127.0.0.1"
 _SERVED = {"view": "look on", "nmea": "NMEA", "gpsd": "gpsd's JSON"}
@@ -112,26 +105,22 @@ def live(
 
     What comes too fast is left out, and counted. Ctrl-C ends it.
     """
-    from evlcp_sdk.io.open import open_source
-    from evlcp_sdk.io.reconnect import ReconnectingSource
-    from evlcp_sdk.live.budget import Budget
-    from evlcp_sdk.live.publisher import Publisher
-    from evlcp_sdk.run import live as run_live
-
     out, lines = result.out, result.make_line_printer([url])
     links = link.load()
     plan = place.plan(links, mcap=result.mcap)
     clock = camera.clock(place)
     serving.check(positions=plan is not None)
     sinks = result.load_sink_names(positions=plan is not None)
-    attitude, publisher = camera.attitude(place), Publisher()
+    attitude, publisher = camera.attitude(place), sdk.publisher.Publisher()
     with (
         stop_on_request() as stopped,
         _serve(serving, publisher, links, url, plan, clock, out),
     ):
         with _show_status(publisher, silent=lines is not None):
-            summary = run_live(
-                ReconnectingSource(partial(open_source, url), stopped) if reconnect else url,
+            summary = sdk.run.live(
+                sdk.reconnect.ReconnectingSource(partial(sdk.open.open_source, url), stopped)
+                if reconnect
+                else url,
                 out,
                 links,
                 plan=plan,
@@ -141,7 +130,7 @@ def live(
                 sinks=sinks,
                 lines=lines,
                 publisher=publisher,
-                budget=Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
+                budget=sdk.budget.Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
                 stopped=stopped.or_when(lambda: out is None and lines is not None and lines.closed),
             )
         print_end(summary, out, lines, as_json=result.as_json)
@@ -152,28 +141,22 @@ def live(
 @contextmanager
 def _serve(
     options: ServingOptions,
-    publisher: Publisher,
-    links: Sequence[Link],
+    publisher: sdk.publisher.Publisher,
+    links: Sequence[sdk.resolve.Link],
     url: str,
-    plan: PositionPlan | None,
-    clock: ClockZero,
+    plan: sdk.navigator.PositionPlan | None,
+    clock: sdk.utc.ClockZero,
     out: Path | None,
 ) -> Iterator[None]:
     """Serve what is asked for, and print where; browsers record into `out`, or this folder."""
-    from evlcp_sdk.link.several import name_links
-    from evlcp_sdk.live.recorder import Recorder
-    from evlcp_sdk.live.server import Server, serve
-    from evlcp_sdk.live.tcp_output import TcpOutput
-    from evlcp_sdk.live.viewer import Viewer
-
     camera, recorder = links[0].camera, None
     if options.view_record:
-        recorder = Recorder(publisher, out or Path.cwd(), camera.width, camera.height)
-    servers: dict[str, Server] = {}
+        recorder = sdk.recorder.Recorder(publisher, out or Path.cwd(), camera.width, camera.height)
+    servers: dict[str, sdk.server.Server] = {}
     if options.view:
-        servers["view"] = Viewer(
+        servers["view"] = sdk.viewer.Viewer(
             publisher,
-            name_links(links),
+            sdk.several.name_links(links),
             name=Path(url).name,
             sites=plan.sites if plan is not None else (),
             host=options.view_host,
@@ -182,8 +165,10 @@ def _serve(
         )
     for kind, port in (("nmea", options.nmea_port), ("gpsd", options.gpsd_port)):
         if port is not None:
-            servers[kind] = TcpOutput(publisher, gpsd=kind == "gpsd", port=port, clock_zero=clock)
-    with serve(publisher, servers.values(), recorder) if servers else nullcontext():
+            servers[kind] = sdk.tcp_output.TcpOutput(
+                publisher, gpsd=kind == "gpsd", port=port, clock_zero=clock
+            )
+    with sdk.server.serve(publisher, servers.values(), recorder) if servers else nullcontext():
         for kind, server in servers.items():
             print_stderr(f"{_SERVED[kind]} at {server.url}")
         yield
@@ -202,7 +187,7 @@ def _exit_code(summary: dict[str, Any], interrupted: Path | None) -> int:
 
 
 @contextmanager
-def _show_status(publisher: Publisher, *, silent: bool) -> Iterator[None]:
+def _show_status(publisher: sdk.publisher.Publisher, *, silent: bool) -> Iterator[None]:
     """Show the status in a line on stderr, on a terminal only, and not between lines of JSON."""
     from rich.live import Live
 
@@ -222,10 +207,8 @@ def _show_status(publisher: Publisher, *, silent: bool) -> Iterator[None]:
         yield
 
 
-def format_status(status: LiveStatus) -> str:
+def format_status(status: sdk.loop.LiveStatus) -> str:
     """The status of a live run, in a line."""
-    from evlcp_sdk.live.budget import LEVELS
-
     text = f"{status.elapsed_s:.0f} s, {status.events_per_s / 1e6:.1f} Mev/s"
     if frames := status.counts.get("frames", 0):
         text += f", {frames} frames"
@@ -236,5 +219,5 @@ def format_status(status: LiveStatus) -> str:
     if lost := sum(loss.count for loss in status.losses.values()):
         text += f", {lost} lost"
     # The text of a level adds to those before.
-    shed = ", ".join(LEVELS[1 : status.level + 1])
+    shed = ", ".join(sdk.budget.LEVELS[1 : status.level + 1])
     return f"{text}; {shed}" if shed else text

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections import Counter
+from typing import Any
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, echo, print_json
-
-if TYPE_CHECKING:
-    from evlcp_sdk.plugin.registry import InstalledAlgorithm, Registry
+from evlcp_sdk.errors import PluginError
 
 
 def plugins(as_json: Json = False) -> None:
@@ -19,35 +19,28 @@ def plugins(as_json: Json = False) -> None:
 
     Exit code 0, also when plugins are broken and left out.
     """
-    from evlcp_sdk.plugin.registry import Registry
-
-    table = tabulate_plugins(Registry.load())
+    table = tabulate_plugins(sdk.registry.Registry.load())
     if as_json:
         print_json(table, 2)
     else:
         echo(_format_table(table))
 
 
-def tabulate_plugins(registry: Registry) -> dict[str, list[dict[str, Any]]]:
+def tabulate_plugins(registry: sdk.registry.Registry) -> dict[str, list[dict[str, Any]]]:
     """Roles, algorithms and broken plugins, as `--json` prints them."""
-    from collections import Counter
-
-    from evlcp_sdk.plugin.records import find_message_kinds, find_sinks
-    from evlcp_sdk.plugin.roles import ROLES
-
     # This may find more broken plugins.
-    find_sinks(registry)
-    find_message_kinds(registry)
+    sdk.records.find_sinks(registry)
+    sdk.records.find_message_kinds(registry)
     entries = registry.list_algorithms()
     count = Counter((e.algorithm.role, e.algorithm.id) for e in entries)
     return {
-        "roles": [{"role": r.name, "verb": r.verb, "default": r.default} for r in ROLES.values()],
+        "roles": [{"role": r.name, "verb": r.verb, "default": r.default} for r in sdk.roles.ROLES.values()],
         "algorithms": [
             {
                 **{key: getattr(e.algorithm, key) for key in ("role", "id", "revision", "summary")},
                 "distribution": e.distribution,
                 "version": e.version,
-                "default": ROLES[e.algorithm.role].default == e.algorithm.id,
+                "default": sdk.roles.ROLES[e.algorithm.role].default == e.algorithm.id,
                 "conflict": count[e.algorithm.role, e.algorithm.id] > 1,
                 "fault": _find_fault(e),
             }
@@ -59,14 +52,11 @@ def tabulate_plugins(registry: Registry) -> dict[str, list[dict[str, Any]]]:
     }
 
 
-def _find_fault(installed: InstalledAlgorithm) -> str | None:
+def _find_fault(installed: sdk.registry.InstalledAlgorithm) -> str | None:
     """Why another package's algorithm cannot be used; None for one that can."""
-    from evlcp_sdk.errors import PluginError
-    from evlcp_sdk.plugin.registry import load_class
-
     try:
         if installed.distribution != "evlcp-sdk":
-            load_class(installed)
+            sdk.registry.load_class(installed)
     except PluginError as fault:
         return str(fault)
     return None

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Dask, make_executor, print_json, progress_bar, silence_matplotlib
 from evlcp_sdk.cli._receiving import (
@@ -27,13 +29,6 @@ from evlcp_sdk.cli._summary import print_end
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 from evlcp_sdk.signals import EndRequest, stop_on_request
 
-if TYPE_CHECKING:
-    from datetime import datetime
-
-    from evlcp_sdk.link.resolve import Link
-    from evlcp_sdk.study.jobs import Executor, Outcome
-    from evlcp_sdk.utc import PulseClock
-
 
 @dataclass(frozen=True)
 class ReceiveJob:
@@ -41,7 +36,7 @@ class ReceiveJob:
 
     url: str
     folder: Path | None
-    link: Link | None = None
+    link: sdk.resolve.Link | None = None
 
 
 @command
@@ -113,22 +108,20 @@ def receive(
 def _run_jobs(
     jobs: Sequence[ReceiveJob],
     decode: Callable[..., dict[str, Any]],
-    executor: Executor,
+    executor: sdk.jobs.Executor,
     result: ResultOptions,
     lines: LinePrinter | None,
     *,
     in_process: bool,
-) -> list[Outcome[ReceiveJob, dict[str, Any]]]:
+) -> list[sdk.jobs.Outcome[ReceiveJob, dict[str, Any]]]:
     """Decode all, in this process or in workers; print how each ended.
 
     Raises:
         InterruptedRunError: The user has ended it.
     """
-    from evlcp_sdk.study.jobs import stop_workers
-
-    outcomes: list[Outcome[ReceiveJob, dict[str, Any]]] = []
+    outcomes: list[sdk.jobs.Outcome[ReceiveJob, dict[str, Any]]] = []
     with (
-        stop_on_request(stop_workers) as stopped,
+        stop_on_request(sdk.jobs.stop_workers) as stopped,
         # In this process, each recording has a bar of its own.
         nullcontext() if in_process else progress_bar("recordings") as advance,
         ExitStack() as stack,
@@ -151,14 +144,14 @@ def _run_jobs(
     return outcomes
 
 
-def _print_failure(outcome: Outcome[ReceiveJob, dict[str, Any]], *, as_json: bool) -> None:
+def _print_failure(outcome: sdk.jobs.Outcome[ReceiveJob, dict[str, Any]], *, as_json: bool) -> None:
     message = outcome.fault.message if outcome.fault else "no result"
     print_stderr(message)
     if as_json:
         print_json({"status": "failed", "error": message, "recording": {"path": outcome.job.url}})
 
 
-def _exit_code(outcomes: Sequence[Outcome[ReceiveJob, dict[str, Any]]], *, strict: bool) -> int:
+def _exit_code(outcomes: Sequence[sdk.jobs.Outcome[ReceiveJob, dict[str, Any]]], *, strict: bool) -> int:
     """The code of the worst failure; else of a recording of which much was dropped, or of a warning."""
     failures = [one.fault.exit_code for one in outcomes if one.fault is not None]
     summaries = [one.value for one in outcomes if one.value is not None]
@@ -169,17 +162,14 @@ def _exit_code(outcomes: Sequence[Outcome[ReceiveJob, dict[str, Any]]], *, stric
     return max(failures, default=0) or DEGRADED * ("degraded" in statuses) or int(strict and has_warnings)
 
 
-def _infer_job_link(job: ReceiveJob, link: Link) -> ReceiveJob:
+def _infer_job_link(job: ReceiveJob, link: sdk.resolve.Link) -> ReceiveJob:
     """Give a job the link that fits its recording best, and print it."""
-    from evlcp_sdk.diagnosis.diagnose import infer_link
-    from evlcp_sdk.io.open import STDIN, open_source
-
-    if job.url == STDIN:
+    if job.url == sdk.open.STDIN:
         raise typer.BadParameter(
             "standard input is read once, and links are tried on it first", param_hint="--link"
         )
-    with open_source(job.url) as source:
-        trials = infer_link(source, link)
+    with sdk.open.open_source(job.url) as source:
+        trials = sdk.diagnose.infer_link(source, link)
     best = trials[0]
     name, due = Path(job.url).name, best.frames + best.rejected
     for explanation in dict.fromkeys(one.explanation for one in trials if one.explanation):
@@ -197,15 +187,15 @@ def _decode(
     job: ReceiveJob,
     *,
     stopped: EndRequest | None,
-    links: tuple[Link, ...],
-    clock: Callable[[], datetime | PulseClock | None],
+    links: tuple[sdk.resolve.Link, ...],
+    clock: Callable[[], datetime | sdk.utc.PulseClock | None],
     lines: LinePrinter | None,
     **options: Any,
 ) -> dict[str, Any]:
     """Decode a recording with a bar until `stopped`, or quietly in a worker; return its summary."""
-    from evlcp_sdk.run import receive_to_folder
-
-    run = partial(receive_to_folder, job.url, job.folder, job.link or links, clock_zero=clock(), **options)
+    run = partial(
+        sdk.run.receive_to_folder, job.url, job.folder, job.link or links, clock_zero=clock(), **options
+    )
     if stopped is not None:
         stop = stopped.or_when(lambda: job.folder is None and lines is not None and lines.closed)
         with progress_bar(_source_name(job.url), by_bytes=True) as advance:
@@ -217,15 +207,11 @@ def _decode(
 
 
 def _source_name(url: str) -> str:
-    from evlcp_sdk.io.open import STDIN
-
-    return "standard input" if url == STDIN else Path(url).name
+    return "standard input" if url == sdk.open.STDIN else Path(url).name
 
 
 def _make_jobs(recordings: Sequence[str], out: Path | None, lines: LinePrinter | None) -> list[ReceiveJob]:
-    from evlcp_sdk.io.open import STDIN
-
-    if STDIN in recordings and len(recordings) > 1:
+    if sdk.open.STDIN in recordings and len(recordings) > 1:
         raise typer.BadParameter("standard input is received by itself", param_hint="REC...")
     if out is None:
         if lines is None:

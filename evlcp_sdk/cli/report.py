@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, console, echo, print_json
 from evlcp_sdk.cli._tables import print_table
-
-if TYPE_CHECKING:
-    from evlcp_sdk.study.summary import Summary
 
 
 def report(
@@ -39,22 +37,16 @@ def report(
 
     The page needs no network. A campaign that still runs can be looked at, too.
     """
-    from evlcp_sdk.files import Outputs
-    from evlcp_sdk.report.drawing import save_plots
-    from evlcp_sdk.study.report import draw_charts, render_campaign
-    from evlcp_sdk.study.store import Store
-    from evlcp_sdk.study.summary import summarize
-
     if markdown and as_json:
         raise typer.BadParameter("give one of --markdown and --json", param_hint="--json")
-    with Store(results) as store:
-        summary = summarize(store)
+    with sdk.store.Store(results) as store:
+        summary = sdk.summary.summarize(store)
     folder = figures or (out.parent / f"{out.stem}-figures" if out is not None else None)
-    with Outputs() as outputs:
+    with sdk.files.Outputs() as outputs:
         if folder is not None:
-            save_plots(draw_charts(summary), summary.plan.name, folder, outputs)
+            sdk.drawing.save_plots(sdk.report.draw_charts(summary), summary.plan.name, folder, outputs)
         if out is not None:
-            outputs.write_text(render_campaign(summary), out)
+            outputs.write_text(sdk.report.render_campaign(summary), out)
     if as_json:
         print_json(summary.to_dict(), 1)
     elif markdown:
@@ -67,7 +59,7 @@ def report(
             console().print(f"written: {out}, {folder}/*.png, *.svg", style="dim")
 
 
-def print_tables(summary: Summary) -> None:
+def print_tables(summary: sdk.summary.Summary) -> None:
     """Print every figure, the positions, and the paper's figures beside those of the campaign."""
     for number, (head, rows, names) in enumerate(_collect_tables(summary)):
         if number:
@@ -75,7 +67,7 @@ def print_tables(summary: Summary) -> None:
         print_table(console(), head, rows, names)
 
 
-def to_markdown(summary: Summary) -> str:
+def to_markdown(summary: sdk.summary.Summary) -> str:
     """The same tables as Markdown, the paper's first."""
     parts = []
     for head, rows, _ in reversed(_collect_tables(summary)):
@@ -85,14 +77,11 @@ def to_markdown(summary: Summary) -> str:
     return "\n\n".join(parts)
 
 
-def _collect_tables(summary: Summary) -> list[tuple[Sequence[str], Sequence[Sequence[str]], int]]:
+def _collect_tables(summary: sdk.summary.Summary) -> list[tuple[Sequence[str], Sequence[Sequence[str]], int]]:
     """Head and rows of each table that has rows, and the number of columns that name a row."""
-    from evlcp_sdk.study import report
-    from evlcp_sdk.study.summary import compare_with_paper
-
     tables: list[tuple[Sequence[str], Sequence[Sequence[str]], int]] = [
-        (*report.figure_rows(summary), 2),
-        (report.POSITION_HEAD, report.position_rows(summary), 1),
-        (report.PAPER_HEAD, report.paper_rows(compare_with_paper(summary.series)), 3),
+        (*sdk.report.figure_rows(summary), 2),
+        (sdk.report.POSITION_HEAD, sdk.report.position_rows(summary), 1),
+        (sdk.report.PAPER_HEAD, sdk.report.paper_rows(sdk.summary.compare_with_paper(summary.series)), 3),
     ]
     return [table for table in tables if table[1]]

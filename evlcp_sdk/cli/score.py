@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, console, print_json
 from evlcp_sdk.cli._stderr import print_stderr
 
@@ -26,21 +27,16 @@ def score(
 
     A result of another link than that of the truth is refused.
     """
-    from evlcp_sdk.sim.truth import read_truth
-    from evlcp_sdk.study.frames import read_frames
-    from evlcp_sdk.study.match import check_link
-    from evlcp_sdk.study.score import links_of_result, score_frames
-
-    links = links_of_result(folder)
-    frames = read_frames(folder)
-    truth = read_truth(truth_file)
+    links = sdk.score.links_of_result(folder)
+    frames = sdk.frames.read_frames(folder)
+    truth = sdk.truth.read_truth(truth_file)
     if not links:
         print_stderr(f"{folder}/summary.json: not there, so nothing says with which link it was received")
     else:
-        check_link(truth, links, str(folder))
+        sdk.match.check_link(truth, links, str(folder))
     for warning in truth.warnings:
         print_stderr(warning)
-    table = score_frames(frames, truth, links if len(links) > 1 else None)
+    table = sdk.score.score_frames(frames, truth, links if len(links) > 1 else None)
     if frames and not any(bar["frames_found"] for bar in table["bars"]):
         print_stderr(
             f"warning: no row of {folder} matches {truth_file}: another recording's, by times or places"

@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._stderr import print_stderr
+from evlcp_sdk.signals import stop_on_request
 
 
 def serve(
@@ -31,19 +33,16 @@ def serve(
 
     A recording begins when somebody has connected. Nothing is encrypted, and whoever can connect gets all.
     """
-    from evlcp_sdk.io.interruptible import open_until_stopped
-    from evlcp_sdk.io.replay import ReplaySource
-    from evlcp_sdk.live.sender import Sender
-    from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.signals import stop_on_request
-
     address = None if tcp is None else _parse_address(tcp)
     if address is None and unix is None:
         raise typer.BadParameter("give --tcp PORT, or --unix PATH", param_hint="--tcp")
-    with stop_on_request() as stopped, open_until_stopped(url, Registry.load(), stopped) as opened:
-        recorded = not opened.live or isinstance(opened, ReplaySource)
-        source = opened if opened.live else ReplaySource(opened)
-        with Sender(source, address, unix) as sender:
+    with (
+        stop_on_request() as stopped,
+        sdk.interruptible.open_until_stopped(url, sdk.registry.Registry.load(), stopped) as opened,
+    ):
+        recorded = not opened.live or isinstance(opened, sdk.replay.ReplaySource)
+        source = opened if opened.live else sdk.replay.ReplaySource(opened)
+        with sdk.sender.Sender(source, address, unix) as sender:
             if address is not None:
                 print_stderr(f"sending {url} to whoever connects to tcp://{address[0]}:{sender.port}")
             if unix is not None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, Overrides, console, echo, print_json, progress_bar
 from evlcp_sdk.formatting import format_count
 
@@ -55,13 +57,11 @@ def simulate(
         _list_presets(as_json=as_json)
         return
     if show:
-        from evlcp_sdk.sim import preset_text
-
         if preset is None or scene_file or overrides or link:
             raise typer.BadParameter(
                 "prints a --preset as it is, nothing else beside it", param_hint="--show"
             )
-        echo(preset_text(preset), nl=False)
+        echo(sdk.scene.preset_text(preset), nl=False)
         return
     source = _choose_source(scene_file, preset)
     if out is None:
@@ -70,26 +70,24 @@ def simulate(
 
 
 def _list_presets(*, as_json: bool) -> None:
-    from evlcp_sdk.sim import preset_names, preset_text
-
     if as_json:
-        print_json(preset_names())
+        print_json(sdk.scene.preset_names())
         return
-    for name in preset_names():
-        comments = (line.lstrip("# ") for line in preset_text(name).splitlines() if line.startswith("#"))
+    for name in sdk.scene.preset_names():
+        comments = (
+            line.lstrip("# ") for line in sdk.scene.preset_text(name).splitlines() if line.startswith("#")
+        )
         console().print(f"{name:14} {next(comments, '')}")
 
 
 def _choose_source(scene_file: str | None, preset: str | None) -> Path | str:
-    from evlcp_sdk.sim import preset_names, preset_text
-
     if (scene_file is None) == (preset is None):
         raise typer.BadParameter("name either a scene.toml or a --preset", param_hint="scene.toml")
     if preset is not None:
-        preset_text(preset)  # raises if there is none
+        sdk.scene.preset_text(preset)  # raises if there is none
         return preset
     assert scene_file is not None
-    if scene_file in preset_names() and not os.path.lexists(scene_file):
+    if scene_file in sdk.scene.preset_names() and not os.path.lexists(scene_file):
         raise typer.BadParameter(
             f"{scene_file}: no such file; for the preset: --preset {scene_file}", param_hint="scene.toml"
         )
@@ -106,11 +104,7 @@ def _render(
     *,
     as_json: bool,
 ) -> None:
-    import time
-
-    from evlcp_sdk.simulated import simulate as render
-
-    simulated = render(source, seed, link=link, overrides=overrides, threads=threads)
+    simulated = sdk.simulated.simulate(source, seed, link=link, overrides=overrides, threads=threads)
     scene = simulated.scene
     start_s = time.perf_counter()
     with progress_bar(out.name) as advance:

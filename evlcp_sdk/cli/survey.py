@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, print_json
 from evlcp_sdk.cli._receiving import PlaceOptions
 from evlcp_sdk.formatting import format_count
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from evlcp_sdk.place.survey import SurveyedBar
 
 
 @command
@@ -45,14 +43,9 @@ def survey(
     poses.csv is that of `evlcp calibrate`, with heading_deg, pitch_deg and roll_deg. What all poses may have
     wrong in common, by position_sigma_m and attitude_sigma_deg, is in the sigmas of the sites.
     """
-    from evlcp_sdk import surveying
-    from evlcp_sdk.link.several import load_links
-    from evlcp_sdk.place.calibration import read_poses
-    from evlcp_sdk.scene.attitude import AttitudeLog
-
     if (poses is None) == (place.sites is None):
         raise typer.BadParameter("give --poses, or --sites of known bars", param_hint="--poses")
-    links = load_links(link_files, overrides or [])
+    links = sdk.several.load_links(link_files, overrides or [])
     if poses is not None:
         for name, value in (
             ("--attitude", place.attitude_file),
@@ -61,23 +54,18 @@ def survey(
         ):
             if value is not None:
                 raise typer.BadParameter("needs --sites", param_hint=name)
-        surveyed = surveying.survey(recordings, read_poses(poses), links, name=str(poses))
+        surveyed = sdk.surveying.survey(recordings, sdk.calibration.read_poses(poses), links, name=str(poses))
     else:
         plan = place.plan(links)
         assert plan is not None
-        known = None if place.attitude_file is None else AttitudeLog.read(place.attitude_file)
-        surveyed = surveying.survey_along_track(recordings, plan, links, attitude=known)
+        known = None if place.attitude_file is None else sdk.attitude.AttitudeLog.read(place.attitude_file)
+        surveyed = sdk.surveying.survey_along_track(recordings, plan, links, attitude=known)
     _write(surveyed, out, as_json=as_json)
 
 
-def _write(surveyed: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None:
-    from dataclasses import asdict
-
-    from evlcp_sdk.files import Outputs
-    from evlcp_sdk.scene.sites import to_toml
-
-    with Outputs() as outputs:
-        outputs.open(out).write(to_toml([bar.site for bar in surveyed]))
+def _write(surveyed: Sequence[sdk.survey.SurveyedBar], out: Path, *, as_json: bool) -> None:
+    with sdk.files.Outputs() as outputs:
+        outputs.open(out).write(sdk.sites.to_toml([bar.site for bar in surveyed]))
     if as_json:
         bars = [
             asdict(bar.site)
@@ -91,7 +79,7 @@ def _write(surveyed: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None
             console().print(_format_bar(bar))
 
 
-def _format_bar(bar: SurveyedBar) -> str:
+def _format_bar(bar: sdk.survey.SurveyedBar) -> str:
     site = bar.site
     kind = f" ({site.link})" if site.link else ""
     return (

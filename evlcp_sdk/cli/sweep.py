@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._campaign import print_faults, show_progress
 from evlcp_sdk.cli._common import Dask, Json, Workers, console, make_executor, print_json, progress_bar
-
-if TYPE_CHECKING:
-    from evlcp_sdk.study.collect import Progress
-
+from evlcp_sdk.errors import InterruptedRunError
 
 Out = Annotated[
     Path | None,
@@ -48,31 +47,24 @@ def sweep(
 
     A result is kept as soon as it is there: stopped or killed at any moment, the same command goes on.
     """
-    from dataclasses import asdict
-
-    from evlcp_sdk.errors import InterruptedRunError
-    from evlcp_sdk.study.collect import collect_results, progress_of
-    from evlcp_sdk.study.store import Store
-    from evlcp_sdk.study.task import plan_campaign, run_job
-
-    plan = plan_campaign(campaign, overrides or [])
+    plan = sdk.task.plan_campaign(campaign, overrides or [])
     path = out or Path(f"{plan.name}.sqlite")
     if dry_run:
         kept = {}
         if path.exists():
-            with Store(path) as store:
+            with sdk.store.Store(path) as store:
                 kept = store.read_results()
-        progress = progress_of(plan, kept)
+        progress = sdk.collect.progress_of(plan, kept)
     else:
         executor = make_executor(workers, dask)
-        with Store(path, create=True) as store:
+        with sdk.store.Store(path, create=True) as store:
             try:
                 with progress_bar(plan.name) as advance:
-                    progress = collect_results(
-                        plan, store, executor, run_job, partial(show_progress, advance)
+                    progress = sdk.collect.collect_results(
+                        plan, store, executor, sdk.task.run_job, partial(show_progress, advance)
                     )
             except KeyboardInterrupt:
-                progress = progress_of(plan, store.read_results())
+                progress = sdk.collect.progress_of(plan, store.read_results())
                 done = f"{progress.done} of {progress.tasks} tasks are in {path}"
                 raise InterruptedRunError(f"interrupted; {done}; the same command goes on") from None
     print_faults(progress)
@@ -84,7 +76,7 @@ def sweep(
     raise typer.Exit(max((fault.exit_code for _, fault in progress.faults), default=0))
 
 
-def _print_progress(name: str, progress: Progress, written: Path | None) -> None:
+def _print_progress(name: str, progress: sdk.collect.Progress, written: Path | None) -> None:
     screen = console()
     screen.print(
         f"{name}: {progress.done} of {progress.tasks} tasks,"

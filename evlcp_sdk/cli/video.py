@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, print_json, progress_bar
 from evlcp_sdk.formatting import format_count
 
@@ -53,12 +54,9 @@ def video(
     number and distance. Browsers show both WebP and GIF; .mp4, for all other
     programs, takes the extra: [bold]pip install 'evlcp-sdk[mp4]'[/]
     """
-    from evlcp_sdk.link.several import load_links
-    from evlcp_sdk.run import film
-
-    links = load_links(link_files, overrides or [])
+    links = sdk.several.load_links(link_files, overrides or [])
     with progress_bar(Path(recording).name, by_bytes=True) as advance:
-        summary = film(
+        summary = sdk.run.film(
             recording,
             out,
             links,

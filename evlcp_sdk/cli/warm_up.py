@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import tempfile
+import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, console, print_json, progress_bar
+from evlcp_sdk.formatting import format_count
 
 _SCENE = ("duration_s=0.2", "motion.vib_rate_rad_s=0.3", "bars.payload=messages", "bars.text=warm")
 """A short drive with so much vibration that every way of decoding is needed."""
@@ -19,8 +24,6 @@ def warm_up(as_json: Json = False) -> None:
 
     In an image, before workers start:  [bold]evlcp warm-up[/]
     """
-    from evlcp_sdk.formatting import format_count
-
     with progress_bar("compiling") as advance:
         result = compile_kernels(advance)
     if as_json:
@@ -45,21 +48,13 @@ def compile_kernels(advance: Callable[[int, int], None]) -> dict[str, Any]:
     Returns:
         How many kernels were compiled, the wall-clock time, s, and the folder that keeps them, or None.
     """
-    import tempfile
-    import time
-    from pathlib import Path
-
-    from evlcp_sdk.kernels import count_compiled, find_cache_folder
-    from evlcp_sdk.run import receive_to_folder
-    from evlcp_sdk.simulated import simulate
-
-    compiled_before, start_s = count_compiled(), time.perf_counter()
+    compiled_before, start_s = sdk.kernels.count_compiled(), time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="evlcp-warm-up-") as name:
         recording = Path(name) / "drive.raw"
         advance(0, 2)
-        simulate("drive-30kmh", overrides=_SCENE).save(recording)
+        sdk.simulated.simulate("drive-30kmh", overrides=_SCENE).save(recording)
         advance(1, 2)
-        receive_to_folder(recording, Path(name) / "out")
-    compiled, elapsed_s = count_compiled() - compiled_before, time.perf_counter() - start_s
-    folder = find_cache_folder()
+        sdk.run.receive_to_folder(recording, Path(name) / "out")
+    compiled, elapsed_s = sdk.kernels.count_compiled() - compiled_before, time.perf_counter() - start_s
+    folder = sdk.kernels.find_cache_folder()
     return {"compiled": compiled, "elapsed_s": elapsed_s, "kept_in": None if folder is None else str(folder)}

@@ -8,6 +8,7 @@ import typer
 from evlcp_sdk.cli._common import progress_bar
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs, writing
+from firmware_host.commands import _host as host
 from firmware_host.commands._json import AsJson, print_result
 from firmware_host.commands._line import BoardLine, LineCommand, from_command_line, open_board
 
@@ -30,14 +31,10 @@ def build_images(
 
     For example: [bold]evlcp board build --target stm32f405-8mhz -o build[/]
     """
-    from firmware_host.board.update import UpdatePackage
-    from firmware_host.build import arm_image
-    from firmware_host.images import FlashImage
-
-    elf = arm_image(target)
-    image = FlashImage.read(elf)
+    elf = host.build.arm_image(target)
+    image = host.images.FlashImage.read(elf)
     contents = {suffix: elf.with_suffix(suffix).read_bytes() for suffix in (".elf", ".hex", ".bin")}
-    contents[".update.json"] = UpdatePackage.build(target).to_json().encode()
+    contents[".update.json"] = host.update.UpdatePackage.build(target).to_json().encode()
     paths = [output / f"{target}{suffix}" for suffix in contents]
     with writing(output):
         output.mkdir(parents=True, exist_ok=True)
@@ -72,26 +69,23 @@ def flash(
 
     For example: [bold]evlcp board flash --target stm32f405-8mhz --port /dev/ttyUSB0[/]
     """
-    from firmware_host.build import arm_image
-    from firmware_host.images import FlashImage
-    from firmware_host.ports.rom import BAUD, RomLoader, flash_image
-    from firmware_host.ports.transport import open_transport
-
     if (file is None) == (target is None):
         raise ConfigError("give an image, or --target to build one, one of the two")
     line: BoardLine = context.obj
     if line.port is None:
         raise ConfigError("--port: expected the part's serial port; a part in its ROM is not asked for")
-    image = FlashImage.read(file or arm_image(target or ""))
+    image = host.images.FlashImage.read(file or host.build.arm_image(target or ""))
     given = from_command_line(context, "baud") or (
         context.parent is not None and from_command_line(context.parent, "baud")
     )
-    transport = open_transport(line.port, line.baud if given else BAUD, even_parity=True)
+    transport = host.transport.open_transport(
+        line.port, line.baud if given else host.rom.BAUD, even_parity=True
+    )
     try:
-        loader = RomLoader(transport)
+        loader = host.rom.RomLoader(transport)
         had_brown_out = loader.has_brown_out()
         with progress_bar("flashing") as progress:
-            sectors = flash_image(loader, image, verify, start and not brown_out, progress)
+            sectors = host.rom.flash_image(loader, image, verify, start and not brown_out, progress)
         if brown_out:
             loader.set_brown_out()
     finally:
@@ -130,23 +124,21 @@ def update(
 
     For example: [bold]evlcp board update stm32f405-8mhz.update.json --port /dev/ttyUSB0[/]
     """
-    from firmware_host.board import update as updates
-
     if (file is not None) + (target is not None) + confirm != 1:
         raise ConfigError("give an update, --target to build one, or --confirm, one of the three")
     package = None
     if file is not None:
-        package = updates.UpdatePackage.read(file)
+        package = host.update.UpdatePackage.read(file)
     elif target is not None:
-        package = updates.UpdatePackage.build(target)
+        package = host.update.UpdatePackage.build(target)
     with open_board(context) as board:
         if package is None:
-            running = updates.update_status(board).running
-            updates.confirm_update(board)
+            running = host.update.update_status(board).running
+            host.update.confirm_update(board)
             print_result(f"image {running} is kept", {"image": running, "kept": True}, as_json)
             return
         with progress_bar("updating") as progress:
-            done = updates.update_firmware(board, package, progress, keep)
+            done = host.update.update_firmware(board, package, progress, keep)
     words = f"image {done.image} runs, {done.length} bytes, firmware {done.firmware}"
     table = {"image": done.image, "bytes": done.length, "sequence": done.sequence, "firmware": done.firmware}
     print_result(words + ("" if keep else ", on trial"), table | {"kept": keep}, as_json)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import typer
 
@@ -13,10 +13,8 @@ from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import echo, print_json
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.errors import ConfigError
+from firmware_host.commands import _host as host
 from firmware_host.commands._json import JsonCommand
-
-if TYPE_CHECKING:
-    from firmware_host.board.board import Board
 
 
 @dataclass(frozen=True)
@@ -53,32 +51,25 @@ class BoardLine:
 
     def find_port(self) -> str:
         """The named port, or else the only one on which a board answers."""
-        from firmware_host.board.survey import find_board_port
-
-        return self.port or find_board_port(self.baud)
+        return self.port or host.survey.find_board_port(self.baud)
 
     @contextlib.contextmanager
-    def open(self) -> "Iterator[Board]":
+    def open(self) -> "Iterator[host.board.Board]":
         """Open the board on the line, or the recorded one."""
-        from firmware_host.board.board import Board
-        from firmware_host.board.keys import read_board_key
-        from firmware_host.board.session import Session
-        from firmware_host.emulators.opening import open_port
-        from firmware_host.ports.transport import ReplayTransport
-        from firmware_host.protocol.client import Timing
-
         # an invalid key is reported before the line is opened
-        key = None if self.key is None else read_board_key(self.key)
+        key = None if self.key is None else host.keys.read_board_key(self.key)
         if self.replay is None:
-            line = open_port(self.find_port(), self.baud)
-            session = Session(line, Timing(self.baud), key=key, trace=self.trace)
+            line = host.opening.open_port(self.find_port(), self.baud)
+            session = host.session.Session(line, host.client.Timing(self.baud), key=key, trace=self.trace)
         elif self.trace is not None:
             raise ConfigError("--trace and --replay: give one of the two")
         else:
-            trace = ReplayTransport(self.replay)
-            session = Session(trace, Timing(trace.baud), trace.first, trace.nonce, key=key)
+            trace = host.transport.ReplayTransport(self.replay)
+            session = host.session.Session(
+                trace, host.client.Timing(trace.baud), trace.first, trace.nonce, key=key
+            )
         with session:
-            yield Board(session)
+            yield host.board.Board(session)
 
 
 LINE = tuple(field.name for field in fields(BoardLine))
@@ -125,7 +116,7 @@ def from_command_line(context: Any, name: str) -> bool:
     return getattr(context.get_parameter_source(name), "name", "") == "COMMANDLINE"
 
 
-def open_board(context: typer.Context) -> "AbstractContextManager[Board]":
+def open_board(context: typer.Context) -> "AbstractContextManager[host.board.Board]":
     """Open the board that a command's options select."""
     line: BoardLine = context.obj
     return line.open()
@@ -146,11 +137,8 @@ KeepAlive = Annotated[
 ]
 
 
-def keep_alive(board: "Board") -> None:
+def keep_alive(board: "host.board.Board") -> None:
     """Keep a board's watchdog from acting until Ctrl-C; print changes of state and faults on stderr."""
-    from firmware_host.board.tables import enum_name, flag_names
-    from firmware_host.protocol.generated.requests import BoardFault, State
-
     status = board.status()
     with contextlib.suppress(KeyboardInterrupt):
         while True:
@@ -158,8 +146,11 @@ def keep_alive(board: "Board") -> None:
             board.wait_with_keep_alive(1.0, status)
             status = board.status()
             if (status.state, status.faults) != before:
-                faults = ", ".join(flag_names(BoardFault, status.faults)) or "none"
-                print_stderr(f"{board.session.name}: state {enum_name(State, status.state)}, faults {faults}")
+                faults = ", ".join(host.tables.flag_names(host.requests.BoardFault, status.faults)) or "none"
+                print_stderr(
+                    f"{board.session.name}: state {host.tables.enum_name(host.requests.State, status.state)},"
+                    f" faults {faults}"
+                )
 
 
 def print_program_result(done: Any, as_json: bool) -> None:

@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import LinkFile, Overrides
 from evlcp_sdk.errors import ConfigError
+from firmware_host.commands import _host as host
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-    from evlcp_sdk.link.resolve import Link
-    from firmware_host.board.bank import Bank
 
 
 @dataclass(frozen=True)
@@ -31,15 +30,13 @@ class SymbolOptions:
     link_file: LinkFile = None
     overrides: Overrides = None
 
-    def load_given_link(self) -> "Link | None":
+    def load_given_link(self) -> "sdk.resolve.Link | None":
         """Load the link of -c and --set; None if neither is given."""
-        from evlcp_sdk.link.resolve import load_link
-
         if self.link_file is None and not self.overrides:
             return None
-        return load_link(self.link_file, self.overrides or [])
+        return sdk.resolve.load_link(self.link_file, self.overrides or [])
 
-    def load(self) -> "tuple[NDArray[np.int64], Link]":
+    def load(self) -> "tuple[NDArray[np.int64], sdk.resolve.Link]":
         """Load symbols (packets, frames, clusters) from the file, or draw random ones; with their link.
 
         Raises:
@@ -47,17 +44,13 @@ class SymbolOptions:
             IncompatibleError: The file was made with another link.
             InputError: The file is wrong.
         """
-        from evlcp_sdk.link.resolve import load_link
-        from firmware_host.board.bank import random_packets
-        from firmware_host.board.symbols import read_symbols
-
         link = self.load_given_link()
         if self.symbols is not None and self.random is None:
-            return read_symbols(self.symbols, link)
+            return host.symbols.read_symbols(self.symbols, link)
         if self.random is None or self.symbols is not None:
             raise ConfigError("give symbols as SYMBOLS.json or with --random N, one of the two")
-        link = link or load_link()
-        return random_packets(self.random, link, self.seed), link
+        link = link or sdk.resolve.load_link()
+        return host.bank.random_packets(self.random, link, self.seed), link
 
 
 @dataclass(frozen=True)
@@ -66,13 +59,10 @@ class BankOptions(SymbolOptions):
 
     masks: Annotated[Path | None, typer.Option(metavar="FILE.npy", help="Chips instead of symbols.")] = None
 
-    def load_bank(self) -> "Bank":
+    def load_bank(self) -> "host.bank.Bank":
         """Load the bank; errors as of `load`, or a board cannot play it."""
-        from evlcp_sdk.link.resolve import load_link
-        from firmware_host.board.bank import make_bank, read_masks
-
         if self.masks is None:
-            return make_bank(*self.load())
+            return host.bank.make_bank(*self.load())
         if self.symbols is not None or self.random is not None:
             raise ConfigError("--masks, --random and SYMBOLS.json: give one of them")
-        return read_masks(self.masks, self.load_given_link() or load_link())
+        return host.bank.read_masks(self.masks, self.load_given_link() or sdk.resolve.load_link())

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, echo, print_json, progress_bar
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import Outputs, check_output
 from evlcp_sdk.signals import stop_on_request
-from firmware_host.commands import _firmware
+from firmware_host.commands import _firmware, _host as host
 from firmware_host.commands._json import AsJson, JsonCommand, fault_table, print_result
 from firmware_host.commands._line import (
     LINE,
@@ -35,14 +37,6 @@ from firmware_host.commands._line import (
 from firmware_host.commands._source import BankOptions
 from firmware_host.commands.stream import stream
 from firmware_host.errors import BoardError, RefusedError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from firmware_host.board.board import Board
-    from firmware_host.board.fleet import FleetEntry
-    from firmware_host.board.monitor import BoardReturned, KeyMissing
-    from firmware_host.protocol.generated.requests import StatusReply
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -95,16 +89,13 @@ def ports(
 
     For example: [bold]evlcp board ports --usb 0403[/]
     """
-    from firmware_host.board.survey import survey_ports
-    from firmware_host.board.tables import info_table
-
     line: BoardLine = context.obj
-    found = survey_ports(line.baud, usb, every, ask)
+    found = host.survey.survey_ports(line.baud, usb, every, ask)
     if as_json:
         rows = []
         for f in found:
             port = asdict(f.port)
-            info = info_table(f.info) if f.info else None
+            info = host.tables.info_table(f.info) if f.info else None
             answer = {"asked": f.asked, "board": info, "fault": f.fault or None}
             rows.append({"port": port.pop("device"), **port, **answer})
         print_json(rows)
@@ -112,7 +103,7 @@ def ports(
     for f in found:
         what = f.fault
         if f.info:
-            info = info_table(f.info)
+            info = host.tables.info_table(f.info)
             what = f"{info['hal']} {info['unique_id']}, firmware {info['firmware']}"
         serial = f" {f.port.serial_number}" if f.port.serial_number else ""
         echo(f"{f.port.device}  {f.port.usb or '-'}{serial}  {f.port.description}  {what}")
@@ -127,10 +118,8 @@ def hello(context: typer.Context, as_json: AsJson = False) -> None:
 
     For example: [bold]evlcp board --port native: hello[/]
     """
-    from firmware_host.board.tables import info_table
-
     with open_board(context) as board:
-        _print_table(info_table(board.info), as_json)
+        _print_table(host.tables.info_table(board.info), as_json)
 
 
 @app.command(cls=LineCommand)
@@ -168,20 +157,16 @@ def program(
     """
     if inventory is not None:
         _check_inventory_options(context, "verify", "stay")
-        from firmware_host.board.fleet import program_fleet, read_inventory
-
-        entries, banks = read_inventory(inventory)
-        program_fleet(inventory, entries, banks, verify, partial(print_result, as_json=as_json))
+        entries, banks = host.fleet.read_inventory(inventory)
+        host.fleet.program_fleet(inventory, entries, banks, verify, partial(print_result, as_json=as_json))
         if stay:
             _watch_fleet(inventory, entries, 1.0, None, True, as_json, quiet=True)
         return
-    from firmware_host.board.board import Settings, provision
-
     bank = payload.load_bank()
-    settings = Settings(level, watchdog, watchdog_ms, start, level_limit, duty_limit)
+    settings = host.board.Settings(level, watchdog, watchdog_ms, start, level_limit, duty_limit)
     with open_board(context) as board:
         with progress_bar("programming") as progress:
-            done = provision(board, bank, settings, verify, progress)
+            done = host.board.provision(board, bank, settings, verify, progress)
         print_program_result(done, as_json)
         if stay:
             keep_alive(board)
@@ -208,7 +193,7 @@ def _run_on_boards(
     context: typer.Context,
     inventory: Path | None,
     as_json: bool,
-    work: Callable[[FleetEntry | None, Board], tuple[str, dict[str, Any]]],
+    work: Callable[[host.fleet.FleetEntry | None, host.board.Board], tuple[str, dict[str, Any]]],
     *allowed: str,
 ) -> None:
     """Work on a board, or on all of an inventory, and print the results.
@@ -220,10 +205,10 @@ def _run_on_boards(
             text, table = work(None, board)
         print_result(text, table, as_json)
         return
-    from firmware_host.board.fleet import read_entries, run_fleet
-
     _check_inventory_options(context, *allowed)
-    run_fleet(inventory, read_entries(inventory), work, partial(print_result, as_json=as_json))
+    host.fleet.run_fleet(
+        inventory, host.fleet.read_entries(inventory), work, partial(print_result, as_json=as_json)
+    )
 
 
 @app.command(cls=LineCommand)
@@ -239,15 +224,13 @@ def send(
 
     For example: [bold]evlcp board --port unix:/tmp/board send --random 4 --seed 7[/]
     """
-    from firmware_host.protocol.generated.requests import NO_BANK, Status
-
     bank = payload.load_bank()
     with open_board(context) as board, progress_bar("sending") as progress:
         status = board.status()
-        if status.active_bank == NO_BANK:
+        if status.active_bank == host.requests.NO_BANK:
             raise RefusedError(
                 f"{board.session.name}: nothing is programmed; 'evlcp board program' first",
-                Status.NOTHING_COMMITTED,
+                host.requests.Status.NOTHING_COMMITTED,
             )
         board.check_same_air(bank, status)
         done = board.program(bank, verify, progress)
@@ -298,7 +281,7 @@ def start(
 def stop(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
     """Finish the packet, then dark; what waits in a stream is dropped."""
 
-    def work(board: Board) -> None:
+    def work(board: host.board.Board) -> None:
         board.stop()
         board.wait_dark()
 
@@ -314,17 +297,16 @@ def blank(context: typer.Context, inventory: InventoryFile = None, as_json: AsJs
 def _start_together(
     context: typer.Context, inventory: Path | None, pulse_hz: int, timeout_s: float | None, as_json: bool
 ) -> None:
-    from firmware_host.board.fleet import open_entry, read_entries
-    from firmware_host.board.step import start_together, wait_for_pulse
-
     with contextlib.ExitStack() as stack:
         if inventory is None:
             boards = [stack.enter_context(open_board(context))]
         else:
             _check_inventory_options(context, "pulse_hz", "timeout")
-            entries = read_entries(inventory)
-            boards = [stack.enter_context(open_entry(entry, inventory.parent)) for entry in entries]
-        targets = start_together(boards, pulse_hz)
+            entries = host.fleet.read_entries(inventory)
+            boards = [
+                stack.enter_context(host.fleet.open_entry(entry, inventory.parent)) for entry in entries
+            ]
+        targets = host.step.start_together(boards, pulse_hz)
         table = {board.session.name: target for board, target in zip(boards, targets, strict=True)}
         words = ", ".join(f"{name} for its pulse {target}" for name, target in table.items())
         if timeout_s is None:
@@ -335,15 +317,19 @@ def _start_together(
             return
         if not as_json:
             echo(f"armed: waits for a pulse on PPS ({words}), for at most {timeout_s:g} s")
-        wait_for_pulse(boards, timeout_s)
+        host.step.wait_for_pulse(boards, timeout_s)
     print_result("plays", {"state": "playing", "at_pulse": table}, as_json)
 
 
 def _change_state(
-    context: typer.Context, inventory: Path | None, as_json: bool, ask: Callable[[Board], Any], state: str
+    context: typer.Context,
+    inventory: Path | None,
+    as_json: bool,
+    ask: Callable[[host.board.Board], Any],
+    state: str,
 ) -> None:
 
-    def work(_: FleetEntry | None, board: Board) -> tuple[str, dict[str, Any]]:
+    def work(_: host.fleet.FleetEntry | None, board: host.board.Board) -> tuple[str, dict[str, Any]]:
         ask(board)
         return state if inventory else "", {"state": state}
 
@@ -373,10 +359,8 @@ def watchdog(
     as_json: AsJson = False,
 ) -> None:
     """Choose what the board does when the host falls silent."""
-    from firmware_host.protocol.generated.requests import Watchdog
-
     with open_board(context) as board:
-        board.set_watchdog(Watchdog[action.upper()], after_ms)
+        board.set_watchdog(host.requests.Watchdog[action.upper()], after_ms)
     if as_json:
         print_json({"watchdog": action, "watchdog_ms": after_ms})
     else:
@@ -386,15 +370,13 @@ def watchdog(
 @app.command(cls=LineCommand)
 def status(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
     """Show what a board does, and what went wrong since its reset."""
-    from firmware_host.board.tables import status_table
-
     if inventory is None:
         with open_board(context) as board:
-            _print_table(status_table(board.status()), as_json)
+            _print_table(host.tables.status_table(board.status()), as_json)
         return
 
-    def work(_: FleetEntry | None, board: Board) -> tuple[str, dict[str, Any]]:
-        found = status_table(board.status())
+    def work(_: host.fleet.FleetEntry | None, board: host.board.Board) -> tuple[str, dict[str, Any]]:
+        found = host.tables.status_table(board.status())
         faults = f", faults {', '.join(found['faults'])}" if found["faults"] else ""
         return f"{found['state']}, {found['packets_sent']} packets sent{faults}", {"status": found}
 
@@ -415,24 +397,20 @@ def monitor(
     That keeps the board's watchdog from acting. A board that is gone is looked for until it answers again.
     """
     if inventory is not None:
-        from firmware_host.board.fleet import read_entries
-
         _check_inventory_options(context, "interval", "count", "reconnect")
-        _watch_fleet(inventory, read_entries(inventory), interval, count, reconnect, as_json)
+        _watch_fleet(inventory, host.fleet.read_entries(inventory), interval, count, reconnect, as_json)
         return
-    from firmware_host.board.monitor import watch_board
-
     line: BoardLine = context.obj
     # Without a named port, the one that is found now is kept.
     named = line if line.port or line.replay else replace(line, port=line.find_port())
     with contextlib.suppress(KeyboardInterrupt):
-        for event in watch_board(named.open, interval, count, reconnect):
+        for event in host.monitor.watch_board(named.open, interval, count, reconnect):
             _print_event(event, {"port": named.port}, as_json)
 
 
 def _watch_fleet(
     path: Path,
-    entries: Sequence[FleetEntry],
+    entries: Sequence[host.fleet.FleetEntry],
     interval: float,
     count: int | None,
     reconnect: bool,
@@ -445,17 +423,13 @@ def _watch_fleet(
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    from firmware_host.board.fleet import open_entry
-    from firmware_host.board.monitor import watch_board
-    from firmware_host.protocol.generated.requests import StatusReply
-
     ended, printing = threading.Event(), threading.Lock()
 
-    def watch_entry(entry: FleetEntry) -> None:
-        for event in watch_board(
-            partial(open_entry, entry, path.parent), interval, count, reconnect, reconnect, ended
+    def watch_entry(entry: host.fleet.FleetEntry) -> None:
+        for event in host.monitor.watch_board(
+            partial(host.fleet.open_entry, entry, path.parent), interval, count, reconnect, reconnect, ended
         ):
-            if quiet and isinstance(event, StatusReply):
+            if quiet and isinstance(event, host.requests.StatusReply):
                 continue
             with printing:
                 _print_event(event, {"id": entry.id, "port": entry.port}, as_json)
@@ -472,33 +446,31 @@ def _watch_fleet(
 
 
 def _print_event(
-    event: StatusReply | BoardError | BoardReturned | KeyMissing, which: dict[str, Any], as_json: bool
+    event: host.requests.StatusReply | BoardError | host.monitor.BoardReturned | host.monitor.KeyMissing,
+    which: dict[str, Any],
+    as_json: bool,
 ) -> None:
     """Print a line of `monitor`: a status on stdout, other events on stderr."""
-    from firmware_host.board.monitor import BoardReturned, KeyMissing
-    from firmware_host.board.tables import enum_name, status_table
-    from firmware_host.protocol.generated.requests import State
-
     name = which.get("id") or which["port"]
     if isinstance(event, BoardError):
         if as_json:
             print_json(which | fault_table(event))
         print_stderr(f"{event}; it is looked for, end with Ctrl-C")
-    elif isinstance(event, BoardReturned):
+    elif isinstance(event, host.monitor.BoardReturned):
         if as_json:
             print_json(which | {"back_after_s": round(event.after_s, 3)})
         print_stderr(f"{name}: answers again after {event.after_s:.1f} s")
-    elif isinstance(event, KeyMissing):
+    elif isinstance(event, host.monitor.KeyMissing):
         print_stderr(
             f"{name}: has a key: without it (--key) this host does not keep its watchdog from acting"
         )
     elif as_json:
-        print_json(which | status_table(event))
+        print_json(which | host.tables.status_table(event))
     else:
         head = f"{name}  " if "id" in which else ""
         echo(
-            f"{head}{event.uptime_ms / 1e3:10.1f} s  {enum_name(State, event.state):12}"
-            f" packets {event.packets_sent:8}"
+            f"{head}{event.uptime_ms / 1e3:10.1f} s"
+            f"  {host.tables.enum_name(host.requests.State, event.state):12} packets {event.packets_sent:8}"
             f"  late {event.lateness_ticks:5} (max {event.lateness_max_ticks}) ticks"
             f"  errors crc {event.crc_errors} framing {event.framing_errors} overflow {event.overflow_errors}"
             f"  faults {event.faults:#04x}"
@@ -517,12 +489,10 @@ def verify(
     if inventory is None:
         banks = {"": payload.load_bank()}
     else:
-        from firmware_host.board.fleet import read_inventory
-
         _check_inventory_options(context)
-        _, banks = read_inventory(inventory)
+        _, banks = host.fleet.read_inventory(inventory)
 
-    def compare(entry: FleetEntry | None, board: Board) -> tuple[str, dict[str, Any]]:
+    def compare(entry: host.fleet.FleetEntry | None, board: host.board.Board) -> tuple[str, dict[str, Any]]:
         bank = banks[entry.id if entry else ""]
         number = board.verify(bank)
         table = {"bytes": len(bank.content), "bank": number, "crc": f"{bank.crc:08x}"}
@@ -563,7 +533,7 @@ def save(
     For example: [bold]evlcp board --port /dev/ttyUSB0 save --autostart[/]
     """
 
-    def work(_: FleetEntry | None, board: Board) -> tuple[str, dict[str, Any]]:
+    def work(_: host.fleet.FleetEntry | None, board: host.board.Board) -> tuple[str, dict[str, Any]]:
         reply = board.save(autostart)
         table = {"slot": reply.slot, "save_sequence": reply.save_sequence, "autostart": autostart}
         return f"saved in slot {reply.slot}, number {reply.save_sequence}", table
@@ -602,25 +572,21 @@ def emulate(
 
     For example: [bold]evlcp board emulate native --listen unix:/tmp/board --leds leds.bin[/]
     """
-    from firmware_host.emulators.listening import HostLine, check_listen_address
-    from firmware_host.emulators.models import part_image, serve_part
-    from firmware_host.emulators.native import NativeBoard, serve_board
-
-    check_listen_address(listen, pty=emulator == "native")
+    host.listening.check_listen_address(listen, pty=emulator == "native")
     if leds is not None:
         check_output(leds, regular=False)
     with contextlib.ExitStack() as stack:
         if emulator == "native":
-            board = stack.enter_context(contextlib.closing(NativeBoard(leds, flash, unique_id)))
+            board = stack.enter_context(contextlib.closing(host.native.NativeBoard(leds, flash, unique_id)))
         else:
-            image = part_image(emulator == "rom", flash)
-        line = stack.enter_context(contextlib.closing(HostLine(listen, link)))
+            image = host.models.part_image(emulator == "rom", flash)
+        line = stack.enter_context(contextlib.closing(host.listening.HostLine(listen, link)))
         stopped = stack.enter_context(stop_on_request())
         echo(f"listening on {line.place}")
         if emulator == "native":
-            serve_board(board, line, stopped)
+            host.native.serve_board(board, line, stopped)
         else:
-            serve_part(line, image, flash, leds, stopped)
+            host.models.serve_part(line, image, flash, leds, stopped)
 
 
 @app.command(cls=JsonCommand)
@@ -633,10 +599,9 @@ def keygen(
 
     For example: [bold]evlcp board keygen bar.key[/]
     """
-    from firmware_host.board.keys import make_board_key, read_board_key
-    from firmware_host.protocol.seal import key_name
-
-    name = key_name(read_board_key(file)).hex() if show else make_board_key(file)
+    name = (
+        host.seal.key_name(host.keys.read_board_key(file)).hex() if show else host.keys.make_board_key(file)
+    )
     print_result(name, {"key": name}, as_json)
 
 
@@ -655,9 +620,7 @@ def lock(
 
     For example: [bold]evlcp board --port /dev/ttyUSB0 lock bar.key[/]
     """
-    from firmware_host.board.keys import read_board_key
-
-    key = read_board_key(file)
+    key = host.keys.read_board_key(file)
     with open_board(context) as board:
         board.set_key(key)
         name = board.info.key_name.hex()
@@ -693,12 +656,11 @@ def leds(
 
     For example: [bold]evlcp board leds leds.bin --chips chips.npy[/]
     """
-    from evlcp_sdk.link.resolve import load_link
-    from firmware_host.emulators.led_record import LedRecord
-
-    played = LedRecord.read(record).select_chips()
+    played = host.led_record.LedRecord.read(record).select_chips()
     try:
-        table = played.chips(None if per_led else load_link(link_file, overrides or []).bar.led_clusters())
+        table = played.chips(
+            None if per_led else sdk.resolve.load_link(link_file, overrides or []).bar.led_clusters()
+        )
     except ConfigError as fault:
         raise InputError(f"{record}: {fault}") from fault
     with Outputs() as outputs:

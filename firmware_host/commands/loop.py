@@ -8,7 +8,9 @@ from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import LinkFile, Overrides, console, echo, progress_bar
+from firmware_host.commands import _host as host
 
 
 def loop(
@@ -37,11 +39,7 @@ def loop(
     Your own text:       [bold]evlcp loop --text "Tempo 30" --distance 60[/]
     At slower chips:     [bold]evlcp loop --set air.chip_rate_hz=5000.0[/]
     """
-    from evlcp_sdk.diagnosis.facts import Diagnostic
-    from evlcp_sdk.link.resolve import load_link
-    from firmware_host.loop import run_loop
-
-    link = load_link(link_file, overrides or [])
+    link = sdk.resolve.load_link(link_file, overrides or [])
     screen = console()
     if not as_json:
         screen.print(
@@ -50,14 +48,16 @@ def loop(
     files: list[str] = []
     sinks = ["report"] if report else []
     with progress_bar("rendering") as bar:
-        for step in run_loop(text, link, out, distance_m=distance_m, seed=seed, sinks=sinks, progress=bar):
+        for step in host.loop.run_loop(
+            text, link, out, distance_m=distance_m, seed=seed, sinks=sinks, progress=bar
+        ):
             files += step.files
             if as_json:
                 echo(json.dumps({"step": step.name, **step.figures, "files": list(step.files)}))
                 continue
             screen.print(f"{step.name:9} {step.summary}")
             for warning in step.figures.get("warnings", ()):
-                screen.print(f"          warning: {Diagnostic(**warning)}", style="yellow")
+                screen.print(f"          warning: {sdk.facts.Diagnostic(**warning)}", style="yellow")
     if not as_json:
         screen.print(f"written: {out}/{', '.join(files)}", style="dim")
     if not step.figures["as_sent"]:

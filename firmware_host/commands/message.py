@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, progress_bar
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs, read_bytes
 from evlcp_sdk.signals import stop_on_request
+from firmware_host.commands import _host as host
 from firmware_host.commands._json import AsJson, print_result
 from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, print_program_result
 from firmware_host.commands.stream import Ahead, print_stream_result
@@ -24,9 +26,6 @@ from firmware_host.commands.stream import Ahead, print_stream_result
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-    from evlcp_sdk.link.resolve import Link
-    from firmware_host.board.messages import Content
 
 _MAX_NUMBER = 2**32 - 1
 
@@ -67,16 +66,13 @@ class ContentOptions:
         ),
     ] = None
 
-    def make(self) -> Content:
+    def make(self) -> host.messages.Content:
         """The content, with times from now on.
 
         Raises:
             ConfigError: It is empty, or there are options of a beacon without one.
             InputError: The file cannot be read.
         """
-        from evlcp_sdk.link.compose import encode_utf8
-        from firmware_host.board.messages import Content, choose_site
-
         if not self.time and (self.text, self.file, self.beacon, self.countdown) == (None,) * 4:
             raise ConfigError(
                 "give what to send: --text TEXT, --file FILE, --beacon site.toml, --time or --countdown"
@@ -85,8 +81,12 @@ class ContentOptions:
         if self.beacon is None and (self.key is not None or self.user):
             raise ConfigError("--key and --user belong to a beacon: give --beacon site.toml, too")
         for option, given in (("--text", self.text), ("--user", self.user)):
-            encode_utf8(given or "", option)
-        site = None if self.beacon is None else choose_site(self.beacon, self.transmitter_id, "--id")
+            sdk.compose.encode_utf8(given or "", option)
+        site = (
+            None
+            if self.beacon is None
+            else host.messages.choose_site(self.beacon, self.transmitter_id, "--id")
+        )
         fixed = {
             "data": None if self.file is None else read_bytes(self.file),
             "beacon": site,
@@ -95,7 +95,7 @@ class ContentOptions:
             "transmitter_id": self.transmitter_id,
         }
         now_s = clock_s()
-        return Content(
+        return host.messages.Content(
             fixed,
             text=self.text,
             time=self.time,
@@ -177,12 +177,7 @@ def message(
     Onto a board:    [bold]evlcp tx message --text "Tempo 30" --port /dev/ttyUSB0[/]
     A countdown:     [bold]evlcp tx message --countdown 30 --every 1 --port /dev/ttyUSB0[/]
     """
-    from evlcp_sdk.link.resolve import load_link
-    from firmware_host.board.bank import make_bank
-    from firmware_host.board.board import Settings, provision
-    from firmware_host.board.symbols import symbols_table
-
-    link = load_link(link_file, overrides or [])
+    link = sdk.resolve.load_link(link_file, overrides or [])
     made = content.make()
     if anew.every is None and anew.count is not None:
         raise ConfigError("--count belongs to --every SECONDS")
@@ -192,7 +187,7 @@ def message(
         _send_periodically(made, link, board.line(), repeat, anew, as_json=as_json)
         return
     symbols, summary = _encode_content(made, link, repeat)
-    table = symbols_table(symbols, link, messages=True)
+    table = host.symbols.symbols_table(symbols, link, messages=True)
     write_files(symbols, link, chips, out, table)
     written = [str(path) for path in (out, chips) if path is not None]
     line = board.line(only_named=bool(written))
@@ -204,7 +199,9 @@ def message(
         return
     with line.open() as opened:
         with progress_bar("programming") as progress:
-            done = provision(opened, make_bank(symbols, link), Settings(), True, progress)
+            done = host.board.provision(
+                opened, host.bank.make_bank(symbols, link), host.board.Settings(), True, progress
+            )
         print_result(f"{text}, again and again", summary | {"board": asdict(done)} | table, as_json)
         if not as_json:
             print_program_result(done, as_json)
@@ -214,44 +211,46 @@ def message(
 
 def write_files(
     symbols: NDArray[np.int64],
-    link: Link,
+    link: sdk.resolve.Link,
     chips: Path | None,
     out: Path | None = None,
     table: dict[str, Any] | None = None,
 ) -> None:
     """Write the chips of symbols (packets, frames, clusters), and a table of them, each if it has a file."""
-    from firmware_host.board.bank import symbol_chips
-
     with Outputs() as outputs:
         if chips is not None:
-            outputs.write_array(symbol_chips(symbols, link), chips)
+            outputs.write_array(host.bank.symbol_chips(symbols, link), chips)
         if out is not None:
             outputs.write_text(json.dumps(table) + "\n", out)
 
 
 def _send_periodically(
-    content: Content, link: Link, line: BoardLine | None, repeat: int, anew: PeriodOptions, *, as_json: bool
+    content: host.messages.Content,
+    link: sdk.resolve.Link,
+    line: BoardLine | None,
+    repeat: int,
+    anew: PeriodOptions,
+    *,
+    as_json: bool,
 ) -> None:
-    from firmware_host.board.messages import check_interval, send_periodically
-
     assert anew.every is not None
     if line is None:
         raise ConfigError("--every sends to a board: give --port (or EVLCP_PORT)")
     # Errors are reported before the board waits.
-    check_interval(content, link, repeat, anew.every)
+    host.messages.check_interval(content, link, repeat, anew.every)
     with line.open() as board:
         stream = board.stream(link, anew.ahead)
         with suppress(KeyboardInterrupt), stop_on_request() as stopped, stream:
-            send_periodically(stream, content, link, repeat, anew.every, anew.count, stopped)
+            host.messages.send_periodically(stream, content, link, repeat, anew.every, anew.count, stopped)
     print_stream_result(stream, as_json)
 
 
-def _encode_content(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int64], dict[str, Any]]:
+def _encode_content(
+    content: host.messages.Content, link: sdk.resolve.Link, repeat: int
+) -> tuple[NDArray[np.int64], dict[str, Any]]:
     """Symbols of the packets with the content now, and a summary of its messages."""
-    from evlcp_sdk.link.compose import encode_messages
-
     messages = content.messages_at(link, clock_s())
-    symbols = encode_messages(messages, link.block_coder(), repeat)
+    symbols = sdk.compose.encode_messages(messages, link.block_coder(), repeat)
     return symbols, {
         "messages": [
             {
@@ -289,7 +288,5 @@ def keygen(
 
     For example: [bold]evlcp tx keygen private.pem[/]
     """
-    from evlcp_sdk.air.signing import make_key, public_key, read_key
-
-    public = public_key(read_key(private)) if show else make_key(private)
+    public = sdk.signing.public_key(sdk.signing.read_key(private)) if show else sdk.signing.make_key(private)
     print_result(public, {"public_key": public}, as_json)

@@ -15,20 +15,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.signals import stop_on_request
+from firmware_host.commands import _host as host
 from firmware_host.commands._json import AsJson, print_result
 from firmware_host.commands._line import open_board
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-    from evlcp_sdk.link.blocks import BlockCoder
-    from evlcp_sdk.link.resolve import Link
-    from firmware_host.board.stream import Stream
 
 _POLL_S = 0.005
 _MAX_LINES = 64
@@ -60,9 +58,7 @@ def stream(
 
     For example: [bold]date +%T | evlcp board --port native: stream[/]
     """
-    from evlcp_sdk.link.resolve import load_link
-
-    link = load_link(link_file, overrides or [])
+    link = sdk.resolve.load_link(link_file, overrides or [])
     # a link without room for messages is refused before the board waits
     coder = link.block_coder() if lines == "text" else None
     if coder is not None:
@@ -82,7 +78,7 @@ def stream(
     print_stream_result(queue, as_json)
 
 
-def print_stream_result(stream: Stream, as_json: bool) -> None:
+def print_stream_result(stream: host.stream.Stream, as_json: bool) -> None:
     """Print the result of a stream."""
     round_trips = round(stream.requests / max(1, stream.sent + stream.pauses), 3)
     summary = f"{stream.sent} packets, {round_trips:.2f} round trips a packet"
@@ -95,13 +91,10 @@ def print_stream_result(stream: Stream, as_json: bool) -> None:
 
 
 def _read_packets(
-    file: Path, link: Link, coder: BlockCoder | None, transmitter_id: int, repeat: int
+    file: Path, link: sdk.resolve.Link, coder: sdk.blocks.BlockCoder | None, transmitter_id: int, repeat: int
 ) -> Iterator[Iterable[NDArray[np.int64]] | None]:
     """Packets (frames, clusters) of each line of input; None while there is none."""
     import numpy as np
-
-    from evlcp_sdk.link.compose import iterate_packets, make_messages
-    from firmware_host.board.symbols import parse_symbols
 
     sequence = 0
     number = 0
@@ -118,12 +111,14 @@ def _read_packets(
                 while _list_depth(table) < 3:
                     table = [table]
                 place = Path(f"{file}: line {number}")
-                yield np.repeat(parse_symbols(place, table, link), repeat, axis=0)
+                yield np.repeat(host.symbols.parse_symbols(place, table, link), repeat, axis=0)
             else:
                 # the numbers of messages rise, also within a second
                 sequence = max(sequence + 1, int(time.time()))
-                messages = make_messages(link, text=line, transmitter_id=transmitter_id, sequence=sequence)
-                yield iterate_packets(messages, coder, repeat)
+                messages = sdk.compose.make_messages(
+                    link, text=line, transmitter_id=transmitter_id, sequence=sequence
+                )
+                yield sdk.compose.iterate_packets(messages, coder, repeat)
         except (ValueError, RecursionError) as fault:
             raise InputError(f"{file}: line {number}: not JSON: {fault}") from fault
         except ConfigError as fault:

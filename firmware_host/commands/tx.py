@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import echo, print_json
 from evlcp_sdk.errors import ConfigError
+from firmware_host.commands import _host as host
 from firmware_host.commands._json import AsJson, JsonCommand
 from firmware_host.commands._source import SymbolOptions
 from firmware_host.commands.message import keygen, message, write_files
@@ -18,8 +20,6 @@ from firmware_host.commands.message import keygen, message, write_files
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-    from evlcp_sdk.link.resolve import Link
 
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode="rich", help="Make, show and check what goes on air."
@@ -56,15 +56,13 @@ def frames(
 
 def _format_words(codes: NDArray[np.uint8]) -> list[str]:
     """Codes as hex words, the last chip the least significant bit; empty for codes of no chips."""
-    from evlcp_sdk.air.codebook import word_of_chips
-
     if not codes.shape[1]:
         return [""] * len(codes)
     width = -(-codes.shape[1] // 4)
-    return [f"{word_of_chips(code):0{width}x}" for code in codes]
+    return [f"{sdk.codebook.word_of_chips(code):0{width}x}" for code in codes]
 
 
-def _format_table(symbols: NDArray[np.int64], link: Link) -> str:
+def _format_table(symbols: NDArray[np.int64], link: sdk.resolve.Link) -> str:
     pilots, info = _format_words(link.codebook.pilots), _format_words(link.codebook.codewords)
     none = "-".rjust(len(pilots[0]))
     lines = ["packet frame cluster symbol pilot info"]
@@ -76,7 +74,7 @@ def _format_table(symbols: NDArray[np.int64], link: Link) -> str:
     return "\n".join(lines)
 
 
-def _format_hex(symbols: NDArray[np.int64], link: Link) -> str:
+def _format_hex(symbols: NDArray[np.int64], link: sdk.resolve.Link) -> str:
     pilots, info = _format_words(link.codebook.pilots), _format_words(link.codebook.codewords)
     return "\n".join(
         " ".join(
@@ -87,13 +85,11 @@ def _format_hex(symbols: NDArray[np.int64], link: Link) -> str:
     )
 
 
-def _format_json(symbols: NDArray[np.int64], link: Link) -> str:
-
-    from firmware_host.board.symbols import symbols_table
+def _format_json(symbols: NDArray[np.int64], link: sdk.resolve.Link) -> str:
 
     info = _format_words(link.codebook.codewords)
     return json.dumps(
-        symbols_table(symbols, link)
+        host.symbols.symbols_table(symbols, link)
         | {
             "pilot_words": _format_words(link.codebook.pilots),
             "info_words": [[[info[s] for s in frame] for frame in packet] for packet in symbols.tolist()],
@@ -101,7 +97,7 @@ def _format_json(symbols: NDArray[np.int64], link: Link) -> str:
     )
 
 
-def _format_c(symbols: NDArray[np.int64], link: Link) -> str:
+def _format_c(symbols: NDArray[np.int64], link: sdk.resolve.Link) -> str:
 
     book = link.codebook
     bits = next((n for n in (16, 32, 64) if n >= link.packet.info_chips), None)
@@ -136,12 +132,9 @@ def check(*, sent: SymbolOptions, as_json: AsJson = False) -> None:
 
     For example: [bold]evlcp tx check --random 100[/]
     """
-    from firmware_host.board.bank import symbol_chips
-    from firmware_host.flicker import measure_flicker
-
     symbols, link = sent.load()
     chip_rate = link.packet.chip_rate_hz
-    rows = measure_flicker(symbol_chips(symbols, link), chip_rate)
+    rows = host.flicker.measure_flicker(host.bank.symbol_chips(symbols, link), chip_rate)
     if as_json:
         print_json({"chip_rate_hz": chip_rate, "clusters": [r.to_dict() for r in rows]})
     else:
