@@ -102,6 +102,15 @@ class InterruptedRunError(EvlcpError):
     exit_code = 130
 
 
+@contextmanager
+def name_place(place: str, kind: type[EvlcpError] = ConfigError) -> Iterator[None]:
+    """Turn a `ConfigError` or `InputError` within into one of a kind, with its place before each line."""
+    try:
+        yield
+    except (ConfigError, InputError) as fault:
+        raise kind("\n".join(f"{place}{line}" for line in str(fault).splitlines())) from fault
+
+
 def import_extra(module: str, extra: str, needed_by: str = "", error: type[EvlcpError] = ConfigError) -> Any:
     """Import a module of a package that comes with an extra.
 

@@ -23,27 +23,21 @@ class SpecError(ConfigError):
 
     Args:
         faults: The path and the rest of the message of each, e.g. `(("air", "ppm"), " = 3: unknown key")`.
-        prefix: Of each path.
     """
 
-    def __init__(self, faults: Sequence[tuple[tuple[str, ...], str]], prefix: str = "") -> None:
+    def __init__(self, faults: Sequence[tuple[tuple[str, ...], str]]) -> None:
         self.faults = tuple(faults)
-        super().__init__("\n".join(f"{prefix}{'.'.join(path)}{text}" for path, text in self.faults))
+        super().__init__("\n".join(f"{'.'.join(path)}{text}" for path, text in self.faults))
 
 
 def build_spec(
-    cls: type[T],
-    table: Mapping[str, Any],
-    prefix: str = "",
-    *,
-    hint: Callable[[tuple[str, ...]], str | None] = lambda _: None,
+    cls: type[T], table: Mapping[str, Any], *, hint: Callable[[tuple[str, ...]], str | None] = lambda _: None
 ) -> T:
     """Build the dataclass that a table describes, and those nested in it.
 
     Args:
         cls: A dataclass whose fields have types that pydantic knows; the class itself stays free of pydantic.
         table: As read from TOML.
-        prefix: Of each line of a message, e.g. the file's name.
         hint: Gives the message about an unknown key at a path; None for the nearest known one.
 
     Raises:
@@ -56,17 +50,12 @@ def build_spec(
     evlcp_sdk.specs.SpecError: width = 0: expected greater than 0
     hight = 3: unknown key; did you mean 'height'? (known: ...
     """
-    try:
-        values = validate_table(
-            make_model(cls),
-            table,
-            lambda path: hint(path) or suggest(path[-1], _list_keys(cls, path[:-1])),
-        )
-        return cls(**{name: getattr(values, name) for name in type(values).model_fields})
-    except SpecError as refused:
-        raise SpecError(refused.faults, prefix) from refused
-    except ConfigError as refused:
-        raise ConfigError(f"{prefix}{refused}") from refused
+    values = validate_table(
+        make_model(cls),
+        table,
+        lambda path: hint(path) or suggest(path[-1], _list_keys(cls, path[:-1])),
+    )
+    return cls(**{name: getattr(values, name) for name in type(values).model_fields})
 
 
 def validate_table(

@@ -16,7 +16,7 @@ from typing import Any, Literal, overload
 from evlcp_sdk.air.codebook import Codebook, find_unpaired_codes
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
-from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, PluginError, UnknownAlgorithmError
+from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError, UnknownAlgorithmError, name_place
 from evlcp_sdk.formatting import add_check_hint, format_value, suggest
 from evlcp_sdk.link.blocks import BlockCoder, packet_bits
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
@@ -403,10 +403,8 @@ def load_led_file(table: Mapping[str, Any], folder: Path = Path(), prefix: str =
         raise ConfigError(f"{prefix}bar.leds_file = {format_value(name)}: expected the name of a CSV file")
     if "leds" in keys:
         raise ConfigError(f"{prefix}bar.leds_file = {format_value(name)}: expected it, or bar.leds, not both")
-    try:
+    with name_place(f"{prefix}bar.leds_file: "):
         keys["leds"] = read_leds(folder / name)
-    except (ConfigError, InputError) as fault:
-        raise ConfigError(f"{prefix}bar.leds_file: {fault}") from fault
     loaded["bar"] = {"shape": "table", **keys}
     return loaded
 

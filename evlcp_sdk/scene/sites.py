@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, name_place
 from evlcp_sdk.formatting import suggest, to_toml_value
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.specs import build_spec, read_toml
@@ -232,7 +232,8 @@ def resolve_sites(table: Mapping[str, Any], *, source: str = "") -> tuple[BarSit
     if not isinstance(rows, list) or not rows:
         lines = [f"{prefix}{key}: unknown table{suggest(key, ['bar'])}" for key in table if key != "bar"]
         raise ConfigError("\n".join([*lines, f"{prefix}bar: expected one [[bar]] or more"]))
-    sites = build_spec(_SiteFile, table, prefix).bar
+    with name_place(prefix):
+        sites = build_spec(_SiteFile, table).bar
     faults = []
     for name in ("transmitter_id", "transmitter"):
         first: dict[int, int] = {}

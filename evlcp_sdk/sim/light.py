@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.blocks import HEADER_BYTES, Kind, Message
 from evlcp_sdk.air.codebook import longest_run
 from evlcp_sdk.air.frames import packet_chips
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, name_place
 from evlcp_sdk.files import read_npy
 from evlcp_sdk.link.compose import beacon_of_site, encode_messages
 from evlcp_sdk.link.resolve import Link
@@ -123,10 +123,8 @@ class BarLight:
         self.bar = bar
         self.link = link
         self.payload_seed = seed if bar.seed is None else bar.seed
-        try:
+        with name_place(f"{source}."):
             strips = split_into_strips(bar, link.bar, self.payload_seed)
-        except ConfigError as refused:
-            raise ConfigError(f"{source}.{refused}") from refused
         lights = [led_light_w_m2(bar, strip, lens) for strip in strips]
         self.light_w_m2 = max(lights)
         self.centre_m = (bar.x_m, bar.y_m, bar.z_m)
@@ -141,13 +139,11 @@ class BarLight:
             self.packet_chips = len(self._chips)
             self.longest_us *= max(map(longest_run, self._chips.T))
         else:
-            try:
+            with name_place(f"{source}: "):
                 if bar.payload != "symbols":
                     self._coder = link.block_coder()
                 if bar.payload == "messages":
                     self._cycle = self._encode_messages(site)
-            except ConfigError as refused:
-                raise ConfigError(f"{source}: {refused}") from refused
             self.packet_chips = link.packet.packet_chips
             if bar.symbols is not None:
                 self._check_symbols(bar, source)

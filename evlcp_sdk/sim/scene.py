@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, name_place
 from evlcp_sdk.formatting import format_count, suggest
 from evlcp_sdk.link.resolve import Link, load_led_file, resolve
 from evlcp_sdk.plugin.registry import Registry
@@ -547,7 +547,8 @@ def resolve_scene(
     for i, bar in enumerate(bars if isinstance(bars, list) else []):
         if isinstance(bar, dict) and isinstance(bar.get("link"), Mapping):
             _resolve_link(bar["link"], registry, f"{prefix}bars.{i}.link")
-    scene = build_spec(Scene, table, prefix, hint=_hint_at_link)
+    with name_place(prefix):
+        scene = build_spec(Scene, table, hint=_hint_at_link)
     if folder is not None:
         # File names are relative to the scene's own folder.
         path = scene.motion.path_file and str(folder / scene.motion.path_file)
@@ -573,13 +574,10 @@ def links_of(scene: Scene, registry: Registry | None = None) -> tuple[Link, ...]
 
 
 def _resolve_link(table: LinkTable, registry: Registry | None, where: str) -> Link:
-    try:
+    if isinstance(table, _FileLink) and table.file:
+        where = f"{where}: {table.file}"
+    with name_place(f"{where}: "):
         return _resolve_text(json.dumps(table, default=str), registry)
-    except ConfigError as refused:
-        if isinstance(table, _FileLink) and table.file:
-            where = f"{where}: {table.file}"
-        lines = (f"{where}: {line}" for line in str(refused).splitlines())
-        raise ConfigError("\n".join(lines)) from refused
 
 
 @lru_cache(maxsize=64)
@@ -605,10 +603,8 @@ def _read_links(table: dict[str, Any], folder: Path | None, prefix: str) -> None
     def read(holder: dict[str, Any], where: str) -> None:
         link = holder.get("link")
         if isinstance(link, str):
-            try:
+            with name_place(f"{prefix}{where}: "):
                 holder["link"] = _FileLink.read(link if folder is None else folder / link)
-            except ConfigError as fault:
-                raise ConfigError(f"{prefix}{where}: {fault}") from fault
         elif isinstance(link, Mapping):
             complete = load_led_file(link, folder or Path(), f"{prefix}{where}: ")
             if isinstance(link, _FileLink):

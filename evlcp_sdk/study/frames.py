@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError, InputError, name_place
 from evlcp_sdk.files import parse_csv_number, read_csv
 from evlcp_sdk.results.folder import check_result_file, read_summary
 from evlcp_sdk.values import Packet
@@ -75,10 +75,8 @@ def read_frames(folder: Path | str) -> list[FrameRow]:
     missing = [name for name in _NEEDED if name not in names]
     if missing:
         raise InputError(f"{path}: without the columns {', '.join(missing)}")
-    try:
+    with name_place("", InputError):
         return [_parse_row(path, line, row) for line, row in rows]
-    except ConfigError as fault:
-        raise InputError(str(fault)) from fault
 
 
 def _parse_row(path: Path, line: int, row: Mapping[str, str | None]) -> FrameRow:

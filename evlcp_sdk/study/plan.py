@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, name_place
 from evlcp_sdk.formatting import to_toml_value
 from evlcp_sdk.specs import build_spec, parse_value, read_toml
 from evlcp_sdk.study.tally import Tally
@@ -230,7 +230,8 @@ def load_plan(
     table = read_toml(path)
     for override in overrides:
         _apply_override(table, override)
-    file = build_spec(_File, table, f"{path}: ")
+    with name_place(f"{path}: "):
+        file = build_spec(_File, table)
     folder = Path(path).parent
     faults: list[str] = []
     scenes = _make_cases("scene", file.scene, folder, scene_of, faults, path)

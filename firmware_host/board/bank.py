@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError, InputError, name_place
 from evlcp_sdk.files import read_npy
 from evlcp_sdk.link.resolve import Link
 from firmware_host.protocol.generated.requests import CLUSTERS, ROW_BYTES, Format
@@ -236,7 +236,5 @@ def read_masks(path: Path, link: Link) -> Bank:
     """
     check_rate(link.packet)
     chips = read_npy(path)
-    try:
+    with name_place(f"{path}: ", InputError):
         return Bank.of_chips(chips, link)
-    except ConfigError as fault:
-        raise InputError(f"{path}: {fault}") from fault

@@ -10,12 +10,12 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, name_place
 from evlcp_sdk.formatting import format_value
 from evlcp_sdk.link.compose import encode_messages, encode_utf8, make_messages
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.specs import SpecError, build_spec, read_toml
+from evlcp_sdk.specs import build_spec, read_toml
 from firmware_host.board.bank import Bank, make_bank, random_packets, read_masks
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.keys import read_board_key
@@ -113,16 +113,12 @@ def read_entries(path: Path) -> tuple[FleetEntry, ...]:
         ConfigError: The inventory cannot be read, or a value is wrong; the message names the place, the value
             and what was expected.
     """
-    tables = build_spec(_Tables, read_toml(path), f"{path}: ")
+    with name_place(f"{path}: "):
+        tables = build_spec(_Tables, read_toml(path))
     entries = []
     for i, row in enumerate(tables.board):
-        place = f"{path}: board[{i}]"
-        try:
+        with name_place(f"{path}: board[{i}]: "):
             entries.append(build_spec(FleetEntry, tables.defaults | row))
-        except SpecError as fault:
-            raise SpecError(fault.faults, f"{place}.") from fault
-        except ConfigError as fault:
-            raise ConfigError(f"{place}: {fault}") from fault
     for key in ("id", "port"):
         first: dict[str, int] = {}
         for i, entry in enumerate(entries):

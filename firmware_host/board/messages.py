@@ -1,26 +1,22 @@
 """Messages that a board sends: once, repeatedly, or updated periodically."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
 from time import gmtime, strftime, time as clock_s
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.air.kinds import Countdown
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.compose import encode_messages, iterate_packets, make_messages
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.scene.sites import BarSite, load_sites
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from evlcp_sdk.link.resolve import Link
-    from firmware_host.board.stream import Stream
+from firmware_host.board.stream import Stream
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import InputError, name_place
 from evlcp_sdk.files import read_json
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.link.shared import find_differences
@@ -65,10 +65,8 @@ def _load_link(path: Path, table: dict[str, Any], given: Link | None, registry: 
     tables = table["link"]
     if not isinstance(tables, dict):
         raise InputError(f"{path}: link = {json.dumps(tables)[:40]}, expected the tables of a link")
-    try:
+    with name_place(f"{path}: link: ", InputError):
         own = resolve(tables, registry)
-    except ConfigError as fault:
-        raise InputError("\n".join(f"{path}: link: {line}" for line in str(fault).splitlines())) from fault
     digest = table.get("codebook", own.codebook.digest)
     if digest != own.codebook.digest:
         raise IncompatibleError(

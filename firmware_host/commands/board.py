@@ -16,7 +16,7 @@ from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, echo, print_json, progress_bar
 from evlcp_sdk.cli._stderr import print_stderr
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError, InputError, name_place
 from evlcp_sdk.files import Outputs, check_output
 from evlcp_sdk.signals import stop_on_request
 from firmware_host.commands import _firmware, _host as host
@@ -657,12 +657,10 @@ def leds(
     For example: [bold]evlcp board leds leds.bin --chips chips.npy[/]
     """
     played = host.led_record.LedRecord.read(record).select_chips()
-    try:
+    with name_place(f"{record}: ", InputError):
         table = played.chips(
             None if per_led else sdk.resolve.load_link(link_file, overrides or []).bar.led_clusters()
         )
-    except ConfigError as fault:
-        raise InputError(f"{record}: {fault}") from fault
     with Outputs() as outputs:
         outputs.write_array(table, chips)
         outputs.write_array(played.ticks, chips.with_suffix(".ticks.npy"))
