@@ -54,7 +54,7 @@ class ResultOptions:
         Path | None, typer.Option("-o", "--out", metavar="OUT", help="Folder of the result; made if need be.")
     ] = None
     json_lines: Annotated[
-        str | None, typer.Option("--json-lines", metavar="-", help="Lines of JSON on stdout as they come.")
+        str | None, typer.Option(metavar="-", help="Lines of JSON on stdout as they come.")
     ] = None
     as_json: Annotated[bool, typer.Option("--json", help="Each summary as one line of JSON.")] = False
     figures: Annotated[
@@ -112,8 +112,7 @@ class PlaceOptions:
     PANEL: ClassVar[str] = "Positions"
 
     sites: Annotated[
-        Path | None,
-        typer.Option("--sites", metavar="site.toml", help="Where known bars stand: compute positions."),
+        Path | None, typer.Option(metavar="site.toml", help="Where known bars stand: compute positions.")
     ] = None
     attitude_file: Annotated[
         Path | None, typer.Option("--attitude", metavar="FILE.csv", help="The camera's attitude over time.")
@@ -121,7 +120,6 @@ class PlaceOptions:
     gnss: Annotated[
         Path | None,
         typer.Option(
-            "--gnss",
             metavar="FILE",
             hidden=True,
             help="Fixes of satellites, with sigmas, which enter the track: CSV, or .nmea with --clock-zero.",
@@ -130,7 +128,6 @@ class PlaceOptions:
     clock_zero: Annotated[
         datetime | None,
         typer.Option(
-            "--clock-zero",
             parser=parse_utc,
             metavar="UTC",
             hidden=True,
@@ -161,44 +158,30 @@ class CameraOptions:
     PANEL: ClassVar[str] = "Positions"
 
     heading_deg: Annotated[
-        float | None,
-        typer.Option("--heading-deg", metavar="DEG", help="The camera's heading, clockwise from north."),
+        float | None, typer.Option(metavar="DEG", help="The camera's heading, clockwise from north.")
     ] = None
-    pitch_deg: Annotated[float | None, typer.Option("--pitch-deg", metavar="DEG", help="Its pitch, up.")] = (
-        None
-    )
-    roll_deg: Annotated[
-        float | None, typer.Option("--roll-deg", metavar="DEG", help="Its roll, top to the right.")
-    ] = None
+    pitch_deg: Annotated[float | None, typer.Option(metavar="DEG", help="Its pitch, up.")] = None
+    roll_deg: Annotated[float | None, typer.Option(metavar="DEG", help="Its roll, top to the right.")] = None
     heading_sigma_deg: Annotated[
-        float,
-        typer.Option(
-            "--heading-sigma-deg", min=0, hidden=True, help="Sigma of the heading, unless a file has it."
-        ),
+        float, typer.Option(min=0, hidden=True, help="Sigma of the heading, unless a file has it.")
     ] = 0.5
     gravity_sigma_deg: Annotated[
         float | None,
         typer.Option(
-            "--gravity-sigma-deg",
             min=0,
             hidden=True,
             help="The same of pitch and roll.  [default: 0.1 with a file, 0.5 with angles]",
         ),
     ] = None
     white_sigma_deg: Annotated[
-        float,
-        typer.Option(
-            "--white-sigma-deg", min=0, hidden=True, help="Of what is new in each angle with each line."
-        ),
+        float, typer.Option(min=0, hidden=True, help="Of what is new in each angle with each line.")
     ] = 0.0
     time_sigma_us: Annotated[
-        float,
-        typer.Option("--time-sigma-us", min=0, hidden=True, help="Of the file's times from the camera's."),
+        float, typer.Option(min=0, hidden=True, help="Of the file's times from the camera's.")
     ] = 0.0
     pps: Annotated[
         int | None,
         typer.Option(
-            "--pps",
             min=0,
             max=255,
             metavar="CHANNEL",

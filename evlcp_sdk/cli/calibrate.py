@@ -17,15 +17,12 @@ def calibrate(
     recordings: Annotated[
         list[str], typer.Argument(metavar="REC...", help="Recordings of bars at known sites.")
     ],
-    sites: Annotated[Path, typer.Option("--sites", metavar="site.toml", help="Where the bars stand.")],
-    poses: Annotated[
-        Path, typer.Option("--poses", metavar="poses.csv", help="Where the camera was, and when.")
-    ],
+    sites: Annotated[Path, typer.Option(metavar="site.toml", help="Where the bars stand.")],
+    poses: Annotated[Path, typer.Option(metavar="poses.csv", help="Where the camera was, and when.")],
     link_file: LinkFile = None,
     overrides: Overrides = None,
     limit_px: Annotated[
-        float,
-        typer.Option("--limit-px", min=0.01, help="Uncertainty of the image's corners that is allowed."),
+        float, typer.Option(min=0.01, help="Uncertainty of the image's corners that is allowed.")
     ] = 2.0,
     as_json: Json = False,
 ) -> None:

@@ -17,7 +17,7 @@ def config(
     as_json: Json = False,
     codebook: Annotated[
         Literal["json", "c"] | None,
-        typer.Option("--codebook", help="Only the codes that both ends share, as JSON or as a C header."),
+        typer.Option(help="Only the codes that both ends share, as JSON or as a C header."),
     ] = None,
 ) -> None:
     """Print the resolved link, each value with its meaning and bounds.

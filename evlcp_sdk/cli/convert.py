@@ -24,12 +24,10 @@ def convert(
         typer.Option("-o", "--out", metavar="OUT", help="By its suffix .raw, .mcap, .npz, .csv or .csv.gz."),
     ],
     size: Annotated[
-        str | None,
-        typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of the sensor, where SOURCE does not say."),
+        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Of the sensor, where SOURCE does not say.")
     ] = None,
     format: Annotated[
-        str | None,
-        typer.Option("--format", metavar="NAME", help="EVT2, EVT3, BAG, NPZ or CSV, whatever the suffix."),
+        str | None, typer.Option(metavar="NAME", help="EVT2, EVT3, BAG, NPZ or CSV, whatever the suffix.")
     ] = None,
     as_json: Json = False,
 ) -> None:

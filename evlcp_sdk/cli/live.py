@@ -30,15 +30,11 @@ class ServingOptions:
 
     view: Annotated[bool, typer.Option("--view", help="Serve a page for browsers.")] = False
     view_host: Annotated[
-        str,
-        typer.Option(
-            "--view-host", metavar="ADDRESS", show_default=False, help="0.0.0.0: for other machines, too."
-        ),
+        str, typer.Option(metavar="ADDRESS", show_default=False, help="0.0.0.0: for other machines, too.")
     ] = _HERE
     view_port: Annotated[
         int,
         typer.Option(
-            "--view-port",
             hidden=True,
             min=0,
             max=65535,
@@ -52,12 +48,10 @@ class ServingOptions:
         typer.Option("--view-record", hidden=True, help="Who looks on may record, into OUT or this folder."),
     ] = False
     nmea_port: Annotated[
-        int | None,
-        typer.Option("--nmea-port", min=0, max=65535, metavar="PORT", help="Serve NMEA-0183 by TCP."),
+        int | None, typer.Option(min=0, max=65535, metavar="PORT", help="Serve NMEA-0183 by TCP.")
     ] = None
     gpsd_port: Annotated[
-        int | None,
-        typer.Option("--gpsd-port", min=0, max=65535, metavar="PORT", help="Serve positions as gpsd does."),
+        int | None, typer.Option(min=0, max=65535, metavar="PORT", help="Serve positions as gpsd does.")
     ] = None
 
     def check(self, *, positions: bool) -> None:

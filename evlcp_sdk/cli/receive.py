@@ -55,10 +55,7 @@ def receive(
     ] = False,
     result: ResultOptions,
     workers: Annotated[
-        int,
-        typer.Option(
-            "--workers", min=0, metavar="N", show_default=False, help="Processes for many recordings."
-        ),
+        int, typer.Option(min=0, metavar="N", show_default=False, help="Processes for many recordings.")
     ] = 0,
     cores: Cores = 1,
     dask: Dask = None,

@@ -21,7 +21,6 @@ def report(
     figures: Annotated[
         Path | None,
         typer.Option(
-            "--figures",
             metavar="DIR",
             help="Folder of PNG and SVG; beside the page without it.",
             show_default=False,

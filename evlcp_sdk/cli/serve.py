@@ -18,11 +18,9 @@ def serve(
     ],
     tcp: Annotated[
         str | None,
-        typer.Option("--tcp", metavar="[HOST:]PORT", help="Listen there; this machine only without a host."),
+        typer.Option(metavar="[HOST:]PORT", help="Listen there; this machine only without a host."),
     ] = None,
-    unix: Annotated[
-        Path | None, typer.Option("--unix", metavar="PATH", help="Listen on a Unix socket, too.")
-    ] = None,
+    unix: Annotated[Path | None, typer.Option(metavar="PATH", help="Listen on a Unix socket, too.")] = None,
 ) -> None:
     """Send a recording or a camera to other programs: EVT3 by socket.
 

@@ -22,19 +22,17 @@ def simulate(
         Path | None, typer.Option("-o", "--out", metavar="REC.raw", help="The recording to write.")
     ] = None,
     preset: Annotated[
-        str | None, typer.Option("--preset", metavar="NAME", help="A scene that comes with the package.")
+        str | None, typer.Option(metavar="NAME", help="A scene that comes with the package.")
     ] = None,
     link: Annotated[
         str | None,
         typer.Option("-c", "--config", metavar="link.toml", help="Link of the bars, instead of the scene's."),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", min=0, help="Seed of everything random, instead of the scene's.")
+        int | None, typer.Option(min=0, help="Seed of everything random, instead of the scene's.")
     ] = None,
     overrides: Overrides = None,
-    threads: Annotated[
-        int, typer.Option("--threads", min=1, max=256, help="Threads; the recording is the same.")
-    ] = 1,
+    threads: Annotated[int, typer.Option(min=1, max=256, help="Threads; the recording is the same.")] = 1,
     presets: Annotated[bool, typer.Option("--presets", help="List the presets and end.")] = False,
     show: Annotated[
         bool, typer.Option("--show", help="Print the preset's TOML, to start a scene from, and end.")

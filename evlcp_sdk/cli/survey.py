@@ -24,8 +24,7 @@ def survey(
     ],
     out: Annotated[Path, typer.Option("-o", "--out", metavar="site.toml", help="Where the bars stand.")],
     poses: Annotated[
-        Path | None,
-        typer.Option("--poses", metavar="poses.csv", help="Where the camera was, how turned, when."),
+        Path | None, typer.Option(metavar="poses.csv", help="Where the camera was, how turned, when.")
     ] = None,
     place: PlaceOptions,
     link_files: LinkFiles = None,

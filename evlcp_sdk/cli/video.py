@@ -32,12 +32,10 @@ def video(
     link_files: LinkFiles = None,
     overrides: Overrides = None,
     from_ms: From = None,
-    for_ms: Annotated[
-        float, typer.Option("--for-ms", min=0.001, help="How much of the recording to show.")
-    ] = 20.0,
-    slow: Annotated[float, typer.Option("--slow", min=1, help="How many times slower than it was.")] = 400.0,
+    for_ms: Annotated[float, typer.Option(min=0.001, help="How much of the recording to show.")] = 20.0,
+    slow: Annotated[float, typer.Option(min=1, help="How many times slower than it was.")] = 400.0,
     size: Annotated[
-        int, typer.Option("--size", min=64, max=1280, metavar="PX", help="Longest side of the picture.")
+        int, typer.Option(min=64, max=1280, metavar="PX", help="Longest side of the picture.")
     ] = 640,
     whole: Annotated[bool, typer.Option("--whole", help="Show the whole image, not the bars only.")] = False,
     as_json: Json = False,

@@ -23,9 +23,7 @@ class SymbolOptions:
     symbols: Annotated[
         Path | None, typer.Argument(metavar="SYMBOLS.json", help="Symbols and their link.")
     ] = None
-    random: Annotated[
-        int | None, typer.Option("--random", metavar="N", help="N packets of random symbols.")
-    ] = None
+    random: Annotated[int | None, typer.Option(metavar="N", help="N packets of random symbols.")] = None
     seed: Annotated[int, typer.Option(help="Seed of --random.", min=0, metavar="N", show_default=False)] = 0
     link_file: LinkFile = None
     overrides: Overrides = None

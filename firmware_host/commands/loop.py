@@ -14,7 +14,7 @@ from firmware_host.commands import _host as host
 
 
 def loop(
-    text: Annotated[str, typer.Option("--text", metavar="TEXT", help="What is sent.")] = "Road works",
+    text: Annotated[str, typer.Option(metavar="TEXT", help="What is sent.")] = "Road works",
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder of all files.")] = Path(
         "loop-out"
     ),
@@ -22,7 +22,7 @@ def loop(
         float, typer.Option("--distance", metavar="M", min=1.0, max=1000.0, help="From camera to bar.")
     ] = 50.0,
     seed: Annotated[
-        int, typer.Option("--seed", min=0, max=2**32 - 1, help="Seed of the scene: its noise, its start.")
+        int, typer.Option(min=0, max=2**32 - 1, help="Seed of the scene: its noise, its start.")
     ] = 0,
     report: Annotated[
         bool, typer.Option("--report", help="Also write received/report.html: the bar in slow motion, plots.")
