@@ -6,13 +6,16 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 
 import evlcp_sdk as evlcp
 from evlcp_sdk import errors, values
+from evlcp_sdk.cli import _sdk
 from evlcp_sdk.plugin import roles
+from firmware_host.commands import _host
 
 FACE = Path(evlcp.__file__)
 
@@ -54,13 +57,28 @@ def test_the_names_are_these_and_described() -> None:
         assert getattr(evlcp, name) is found
 
 
-def test_what_type_checkers_see_is_what_is_found() -> None:
-    """The imports under TYPE_CHECKING name the same objects."""
-    (text,) = re.findall(r"^if TYPE_CHECKING:\n((?: .*\n|\n)+)", FACE.read_text(), re.MULTILINE)
+def imports_for_types(path: Path) -> tuple[str, dict[str, Any]]:
+    """Text of the imports under TYPE_CHECKING, and what they give."""
+    (text,) = re.findall(r"^if TYPE_CHECKING:\n((?: .*\n|\n)+)", path.read_text(), re.MULTILINE)
     seen: dict[str, Any] = {}
     exec(textwrap.dedent(text), seen)
+    del seen["__builtins__"]
+    return text, seen
+
+
+@pytest.mark.parametrize("space", [_sdk, _host])
+def test_commands_find_the_modules_that_type_checkers_see(space: ModuleType) -> None:
+    _, seen = imports_for_types(Path(space.__file__ or ""))
+    assert seen == {name: getattr(space, name) for name in seen}
+    with pytest.raises(AttributeError, match="no module 'stor' is listed here"):
+        space.stor
+
+
+def test_what_type_checkers_see_is_what_is_found() -> None:
+    """The imports under TYPE_CHECKING name the same objects."""
+    text, seen = imports_for_types(FACE)
     assert "open = open_source" in text
-    del seen["__builtins__"], seen["open_source"]
+    del seen["open_source"]
     assert seen == {name: getattr(evlcp, name) for name in NAMES}
     # Type checkers take what is named twice for a part of the face.
     for name, other in re.findall(r"(\w+) as (\w+)", text):
