@@ -16,8 +16,11 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError, name_place
 from evlcp_sdk.formatting import suggest, to_toml_value
+from evlcp_sdk.lazy import LazyModule
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.specs import build_spec, read_toml
+
+pymap3d: Any = LazyModule("pymap3d")
 
 _MIN_UPRIGHT = 0.1
 """Sine of a bar axis' elevation below which the bar counts as lying, so that its LEDs face horizontally."""
@@ -128,8 +131,6 @@ class BarSite:
 
     def _to_local_axes(self, offset: NDArray[np.float64], axes: "LocalAxes") -> NDArray[np.float64]:
         """Points by their offsets east, north and up from the bar's centre, in local axes, m, (n, 3)."""
-        import pymap3d
-
         centre = (self.latitude_deg, self.longitude_deg, self.height_m)
         ecef = pymap3d.enu2ecef(*offset.T, *centre)
         return np.stack(pymap3d.ecef2enu(*ecef, *axes.origin), -1)
@@ -177,23 +178,17 @@ class LocalAxes:
 
     def _ecef_axes(self) -> NDArray[np.float64]:
         """East, north and up in the earth's axes (ECEF), as rows."""
-        import pymap3d
-
         return np.stack(pymap3d.enu2uvw(*np.eye(3), self.latitude_deg, self.longitude_deg), -1)
 
     def to_enu(
         self, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike
     ) -> NDArray[np.float64]:
         """Geodetic coordinates (n,) to east, north, up, m, float64 (n, 3); scalars give (3,)."""
-        import pymap3d
-
         place = [np.asarray(v, np.float64) for v in (latitude_deg, longitude_deg, height_m)]
         return np.stack(pymap3d.geodetic2enu(*place, *self.origin), -1)
 
     def to_geodetic(self, enu_m: ArrayLike) -> tuple[Any, Any, Any]:
         """East, north, up (n, 3) or (3,) to latitude and longitude, degrees, and height, m, (n,) each."""
-        import pymap3d
-
         east, north, up = np.moveaxis(np.asarray(enu_m, np.float64), -1, 0)
         latitude, longitude, height = pymap3d.enu2geodetic(east, north, up, *self.origin)
         return latitude, longitude, height

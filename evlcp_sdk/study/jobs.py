@@ -7,21 +7,20 @@ threads before it imports the function's modules.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
+from concurrent import futures
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing.connection import Connection
 from threading import Thread
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, explain_fault, import_extra
-
-if TYPE_CHECKING:
-    from concurrent.futures import Future, ProcessPoolExecutor
-    from multiprocessing.connection import Connection
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -78,24 +77,20 @@ class Processes:
 
     def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
         """See `Inline.run`."""
-        import multiprocessing
-        from concurrent.futures import ProcessPoolExecutor
-        from concurrent.futures.process import BrokenProcessPool
-
         spawn = multiprocessing.get_context("spawn")
         own_end, workers_end = spawn.Pipe()
         # A pool is one process, so that its death concerns one job.
-        make_pool = partial(ProcessPoolExecutor, 1, spawn, _prepare_worker, (workers_end,))
-        pools: dict[Future[Any], ProcessPoolExecutor] = {}
+        make_pool = partial(futures.ProcessPoolExecutor, 1, spawn, _prepare_worker, (workers_end,))
+        pools: dict[futures.Future[Any], futures.ProcessPoolExecutor] = {}
 
-        def start(job: J) -> Future[Any]:
+        def start(job: J) -> futures.Future[Any]:
             idle = next((future for future in pools if future.done()), None)
             # A terminal that closes concerns the parent, not its children.
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
             try:
                 pool = make_pool() if idle is None else pools.pop(idle)
                 future = pool.submit(_run_job, function, job)
-            except BrokenProcessPool:
+            except futures.BrokenExecutor:
                 # The process has died.
                 pool = make_pool()
                 future = pool.submit(_run_job, function, job)
@@ -105,7 +100,7 @@ class Processes:
             return future
 
         try:
-            yield from _run_jobs(start, lambda: self._workers, BrokenProcessPool, jobs)
+            yield from _run_jobs(start, lambda: self._workers, futures.BrokenExecutor, jobs)
         finally:
             own_end.close()
             for pool in pools.values():
@@ -140,8 +135,6 @@ class DaskCluster:
 
     def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
         """See `Inline.run`."""
-        from concurrent.futures import CancelledError
-
         client = self._client
         pool = client.get_executor(pure=False, retries=0)
 
@@ -155,7 +148,7 @@ class DaskCluster:
         except TimeoutError as fault:
             text = f"--dask {self._address}: no worker came within {_WORKERS_S} s"
             raise EvlcpError(text) from fault
-        except (OSError, CancelledError) as fault:
+        except (OSError, futures.CancelledError) as fault:
             text = "the scheduler is gone; what was finished is kept, run again to go on"
             raise EvlcpError(f"--dask {self._address}: {text}") from fault
         finally:
@@ -171,8 +164,6 @@ Executor = Inline | Processes | DaskCluster
 
 def stop_workers() -> None:
     """Interrupt the jobs in child processes, as a terminal's Ctrl-C does."""
-    import multiprocessing
-
     for process in multiprocessing.active_children():
         # It may have ended just now.
         with suppress(ProcessLookupError):
@@ -188,14 +179,15 @@ def _run_job(function: Callable[[J], R], job: J) -> Outcome[J, R]:
 
 
 def _run_jobs(
-    start: Callable[[J], Future[Any]], slots: Callable[[], int], died: type[Exception], jobs: Iterable[J]
+    start: Callable[[J], futures.Future[Any]],
+    slots: Callable[[], int],
+    died: type[Exception],
+    jobs: Iterable[J],
 ) -> Generator[Outcome[J, Any], None, None]:
     """Keep as many jobs running as there are slots; restart one whose worker dies."""
-    from concurrent.futures import FIRST_COMPLETED, wait
-
     source = ((job, 1) for job in jobs)
     retries: deque[tuple[J, int]] = deque()
-    running: dict[Future[Any], tuple[J, int]] = {}
+    running: dict[futures.Future[Any], tuple[J, int]] = {}
     while True:
         for _ in range(slots() - len(running)):
             next_job = retries.popleft() if retries else next(source, None)
@@ -204,7 +196,7 @@ def _run_jobs(
             running[start(next_job[0])] = next_job
         if not running:
             return
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
+        for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
             job, attempt = running.pop(future)
             try:
                 outcome = future.result()
