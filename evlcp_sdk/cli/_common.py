@@ -54,6 +54,14 @@ def print_json(value: object, indent: int | None = None) -> None:
     echo(json.dumps(value, indent=indent))
 
 
+def print_result(text: str, table: object, as_json: bool, indent: int | None = None) -> None:
+    """Print a command's result: a text, unless it is empty, or JSON."""
+    if as_json:
+        print_json(table, indent)
+    elif text:
+        echo(text)
+
+
 class _StderrHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         print_stderr(record.getMessage())

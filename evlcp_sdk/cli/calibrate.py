@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from evlcp_sdk.cli import _sdk as sdk
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, print_json
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, print_result
 from evlcp_sdk.formatting import format_count
 
 
@@ -41,21 +41,17 @@ def calibrate(
     bars = sdk.sites.load_sites(sites)
     known = sdk.calibration.read_poses(poses)
     result = sdk.surveying.calibrate(recordings, bars, known, link, limit_px=limit_px, name=str(poses))
-    if as_json:
-        print_json(
-            {
-                "camera": {name: getattr(result.camera, name) for name in result.sigma},
-                "sigma": dict(result.sigma),
-                "camera_sigma": asdict(result.camera_sigma),
-                "not_determined_corner_px": dict(result.undetermined_px),
-                "views": result.views,
-                "points": result.points,
-                "misfit": result.misfit,
-                "poses": len(known),
-            }
-        )
-    else:
-        console().print(_to_toml(result, len(known)))
+    table = {
+        "camera": {name: getattr(result.camera, name) for name in result.sigma},
+        "sigma": dict(result.sigma),
+        "camera_sigma": asdict(result.camera_sigma),
+        "not_determined_corner_px": dict(result.undetermined_px),
+        "views": result.views,
+        "points": result.points,
+        "misfit": result.misfit,
+        "poses": len(known),
+    }
+    print_result(_to_toml(result, len(known)), table, as_json)
 
 
 def _to_toml(result: sdk.calibration.Calibration, poses: int) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from evlcp_sdk.cli import _sdk as sdk
-from evlcp_sdk.cli._common import Json, LinkFile, console, print_json
+from evlcp_sdk.cli._common import Json, LinkFile, console, print_result
 from evlcp_sdk.errors import ConfigError
 
 _STYLES = {"ok": "green", "failed": "bold red", "skipped": "dim", "excused": "yellow"}
@@ -65,11 +65,8 @@ def check(
         name, table = _check_algorithm(role, id, link_file, overrides or [], excuses or [], as_json=as_json)
     statuses = [law["status"] for law in table["laws"]]
     failed = statuses.count("failed")
-    if as_json:
-        print_json(table | {"failed": failed}, 2)
-    else:
-        counts = (f"{n} {status}" for status in _STYLES if (n := statuses.count(status)))
-        console().print(f"{name}: {', '.join(counts)}")
+    counts = (f"{n} {status}" for status in _STYLES if (n := statuses.count(status)))
+    print_result(f"{name}: {', '.join(counts)}", table | {"failed": failed}, as_json, 2)
     raise typer.Exit(1 if failed else 0)
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from evlcp_sdk.cli import _sdk as sdk
-from evlcp_sdk.cli._common import Json, echo, print_json, progress_bar
+from evlcp_sdk.cli._common import Json, print_result, progress_bar
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.errors import InputError, UnpluggedError
 from evlcp_sdk.formatting import format_count
@@ -46,17 +46,13 @@ def convert(
             raise typer.BadParameter(f"{size!r}: expected {fault}", param_hint="--size") from fault
     with stop_on_request() as stopped, progress_bar(Path(url).name, by_bytes=True) as advance:
         result = sdk.run.convert(url, out, size=sensor_size, format=format, advance=advance, stopped=stopped)
-    if as_json:
-        print_json({"out": str(out)} | result)
-    else:
-        counts = result["counts"]
-        lost = [f"{one['count']} {one['meaning']}" for one in result["losses"].values()]
-        contents = [
-            format_count(counts["events"], "event"),
-            format_count(counts["triggers"], "trigger"),
-            *lost,
-        ]
-        echo(f"{out}: {', '.join(contents)}")
+    counts = result["counts"]
+    contents = [
+        format_count(counts["events"], "event"),
+        format_count(counts["triggers"], "trigger"),
+        *(f"{one['count']} {one['meaning']}" for one in result["losses"].values()),
+    ]
+    print_result(f"{out}: {', '.join(contents)}", {"out": str(out)} | result, as_json)
     if result["error"] is not None:
         print_stderr(result["error"])
         raise typer.Exit((UnpluggedError if result["unplugged"] else InputError).exit_code)

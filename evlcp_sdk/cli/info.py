@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from evlcp_sdk.cli import _sdk as sdk
-from evlcp_sdk.cli._common import Json, echo, print_json
+from evlcp_sdk.cli._common import Json, print_result
 
 
 def info(
@@ -22,10 +22,7 @@ def info(
         table = sdk.describe.describe_source(
             source, str(source.path) if recording == sdk.open.STDIN else recording
         )
-    if as_json:
-        print_json(table, 2)
-    else:
-        echo(_format_table(table))
+    print_result(_format_table(table), table, as_json, 2)
 
 
 def _format_table(table: dict[str, Any]) -> str:

@@ -6,7 +6,7 @@ from collections import Counter
 from typing import Any
 
 from evlcp_sdk.cli import _sdk as sdk
-from evlcp_sdk.cli._common import Json, echo, print_json
+from evlcp_sdk.cli._common import Json, print_result
 from evlcp_sdk.errors import PluginError
 
 
@@ -20,10 +20,7 @@ def plugins(as_json: Json = False) -> None:
     Exit code 0, also when plugins are broken and left out.
     """
     table = tabulate_plugins(sdk.registry.Registry.load())
-    if as_json:
-        print_json(table, 2)
-    else:
-        echo(_format_table(table))
+    print_result(_format_table(table), table, as_json, 2)
 
 
 def tabulate_plugins(registry: sdk.registry.Registry) -> dict[str, list[dict[str, Any]]]:

@@ -5,11 +5,11 @@ from typing import Annotated, Literal
 
 import typer
 
-from evlcp_sdk.cli._common import progress_bar
+from evlcp_sdk.cli._common import print_result, progress_bar
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs, writing
 from firmware_host.commands import _host as host
-from firmware_host.commands._json import AsJson, print_result
+from firmware_host.commands._json import AsJson
 from firmware_host.commands._line import BoardLine, LineCommand, from_command_line, open_board
 
 Target = Literal["stm32f405-8mhz", "stm32f405-12mhz"]

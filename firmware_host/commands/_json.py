@@ -5,18 +5,10 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from evlcp_sdk.cli._common import echo, print_json
+from evlcp_sdk.cli._common import print_json
 from evlcp_sdk.errors import explain_fault
 
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, faults too.")]
-
-
-def print_result(text: str, table: dict[str, Any], as_json: bool) -> None:
-    """Print a command's result: a line of text, if there is any, or JSON."""
-    if as_json:
-        print_json(table)
-    elif text:
-        echo(text)
 
 
 def fault_table(fault: BaseException) -> dict[str, Any]:

@@ -14,13 +14,13 @@ import typer
 
 from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import LinkFile, Overrides, echo, print_json, progress_bar
+from evlcp_sdk.cli._common import LinkFile, Overrides, echo, print_json, print_result, progress_bar
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.errors import ConfigError, InputError, name_place
 from evlcp_sdk.files import Outputs, check_output
 from evlcp_sdk.signals import stop_on_request
 from firmware_host.commands import _firmware, _host as host
-from firmware_host.commands._json import AsJson, JsonCommand, fault_table, print_result
+from firmware_host.commands._json import AsJson, JsonCommand, fault_table
 from firmware_host.commands._line import (
     LINE,
     BoardLine,

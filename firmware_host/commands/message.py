@@ -14,12 +14,12 @@ import typer
 
 from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import LinkFile, Overrides, progress_bar
+from evlcp_sdk.cli._common import LinkFile, Overrides, print_result, progress_bar
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs, read_bytes
 from evlcp_sdk.signals import stop_on_request
 from firmware_host.commands import _host as host
-from firmware_host.commands._json import AsJson, print_result
+from firmware_host.commands._json import AsJson
 from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, print_program_result
 from firmware_host.commands.stream import Ahead, print_stream_result
 

@@ -17,11 +17,11 @@ import typer
 
 from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import LinkFile, Overrides
+from evlcp_sdk.cli._common import LinkFile, Overrides, print_result
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.signals import stop_on_request
 from firmware_host.commands import _host as host
-from firmware_host.commands._json import AsJson, print_result
+from firmware_host.commands._json import AsJson
 from firmware_host.commands._line import open_board
 
 if TYPE_CHECKING:
