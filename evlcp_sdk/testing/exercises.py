@@ -181,11 +181,7 @@ def run_filter(follow: Any, values: Any, peek: Callable[[Any, float], Any] | Non
 
 
 def make_exercise(subject: Subject) -> tuple[tuple[Any, ...], Callable[[], Callable[..., Any]]]:
-    """Make the task of the subject's role, on its link.
-
-    Returns:
-        Inputs with arrays, and what compiles the algorithm again to a function of them.
-    """
+    """Return inputs of the subject's role, and what compiles it again, on its link, to a function of them."""
     inputs, run = _EXERCISES[subject.role]
     return inputs(subject), lambda: partial(run, compile_subject(subject))
 

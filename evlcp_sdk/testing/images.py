@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -219,9 +220,10 @@ def _measure(
     return found
 
 
-def _skip_unless_measuring(subject: Subject) -> None:
+def _measure_m(subject: Subject, *of_image: Any, **more: Any) -> float:
     if not subject.algorithm.measures:
         raise InapplicableLawError("it measures nothing")
+    return _measure(subject, *of_image, **more).distance_m
 
 
 @law(
@@ -245,22 +247,20 @@ def _check_range_shapes(subject: Subject) -> None:
 
 @law("exact", "exact for clusters that lie whole pixels apart")
 def _check_exact(subject: Subject) -> None:
-    _skip_unless_measuring(subject)
     link = link_of(subject)
     require_column(link)
     centres = link.bar.cluster_centres_m()
     for px in _SPACINGS_PX:
         true = link.camera.distance_m(float(np.hypot(*(centres[1] - centres[0]))), px)
         for seed in range(_SEEDS):
-            got = _measure(subject, px, seed).distance_m
+            got = _measure_m(subject, px, seed)
             what = f"{true:.3f} m within {_EXACT:.1%} for clusters exactly {px} px apart, got {got:.3f} m"
             expect(abs(got / true - 1) <= _EXACT, what)
 
 
 @law("monotone", "the wider the image, the nearer")
 def _check_monotone(subject: Subject) -> None:
-    _skip_unless_measuring(subject)
-    found = [_measure(subject, px).distance_m for px in _SPACINGS_PX]
+    found = [_measure_m(subject, px) for px in _SPACINGS_PX]
     got = ", ".join(f"{d:.2f}" for d in found)
     ends = f"{_SPACINGS_PX[0]} px to {_SPACINGS_PX[-1]} px"
     expect((np.diff(found) < 0).all(), f"distances that fall as the spacing grows from {ends}, got {got} m")
@@ -268,18 +268,16 @@ def _check_monotone(subject: Subject) -> None:
 
 @law("moved", "the same wherever the bar stands in the image")
 def _check_moved(subject: Subject) -> None:
-    _skip_unless_measuring(subject)
-    still = _measure(subject).distance_m
+    still = _measure_m(subject)
     for moved in ((2 * GRID_PX, 0), (0, -2 * GRID_PX), (-GRID_PX, GRID_PX)):
-        got = _measure(subject, right_down=moved).distance_m
+        got = _measure_m(subject, right_down=moved)
         what = f"{still:.3f} m wherever the bar stands, got {got:.3f} m {moved} px (right, down) off"
         expect(abs(got / still - 1) <= _EXACT, what)
 
 
 @law("focal-length", "in proportion to the focal length")
 def _check_focal_length(subject: Subject) -> None:
-    _skip_unless_measuring(subject)
-    near = _measure(subject).distance_m
+    near = _measure_m(subject)
     link = link_of(subject)
     camera = replace(link.camera, focal_mm=2 * link.camera.focal_mm)
     measure = compile_or_skip(lambda: subject.algorithm.compile(camera, link.bar, link.codebook))
