@@ -159,9 +159,8 @@ class LightSurvey:
         self.cell_px = 1 << shift
         cells = ((height - 1 >> shift) + 1, (width - 1 >> shift) + 1)
         long_ago = np.iinfo(np.int64).min // 2
-        self._last_us = np.full((height, width), long_ago)
-        self._rise_us = np.full((height, width), long_ago)
-        self._last_p = np.ones((height, width), np.uint8)
+        last_us, rise_us = np.full((2, height, width), long_ago)
+        self._of_pixels = last_us, np.ones((height, width), np.uint8), rise_us
         self._intervals = np.zeros((*cells, BINS), np.uint32)
         self._gaps = np.zeros((*cells, SHORT), np.uint32)
         self.signs = np.zeros((*cells, 2), np.int64)
@@ -181,9 +180,8 @@ class LightSurvey:
             self.first_us = float(events.t_us[0])
         self.last_us = float(events.t_us[-1])
         columns = events.t_us, events.x, events.y, events.p
-        of_pixels = self._last_us, self._last_p, self._rise_us
         counts = self._intervals, self._gaps, self.signs
-        _kernels.add_events(columns, of_pixels, counts, self._shift, _CALM_US)
+        _kernels.add_events(columns, self._of_pixels, counts, self._shift, _CALM_US)
         self.readout.add(events)
         self._keep_window(events)
 

@@ -118,8 +118,7 @@ class Positioner:
                 self._counts["refused" if fix.refusal else "fixes"] += 1
                 fixes.append(fix)
             self._next += 1
-            oldest = (self._next - 1) * self._packet_us
-            remaining = {n: [f for f in kept if f.points_t_us > oldest] for n, kept in self._frames.items()}
+            remaining = {n: [f for f in kept if f.points_t_us > t_us] for n, kept in self._frames.items()}
             self._frames = {number: kept for number, kept in remaining.items() if kept}
             times_us = [f.points_t_us for kept in self._frames.values() for f in kept]
             # With nothing in view, the grid goes on with the next frame.

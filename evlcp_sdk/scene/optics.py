@@ -83,8 +83,7 @@ def _airy_gaussians(unit_px: float) -> tuple[Floats, Floats]:
 def _cdf_integral(z: Floats, sigma: Floats | float) -> Floats:
     """Integral of a normal distribution function up to z."""
     density = np.exp(-0.5 * (z / sigma) ** 2) / math.sqrt(2 * math.pi)
-    total: Floats = z * special.ndtr(z / sigma) + sigma * density
-    return total
+    return np.asarray(z * special.ndtr(z / sigma) + sigma * density)
 
 
 def edge_profile(z: Floats, sigma: Floats | float) -> Floats:

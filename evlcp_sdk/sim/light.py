@@ -280,14 +280,12 @@ class BarLight:
         if self.bar.symbols is not None:
             return np.array(self.bar.symbols[packet % len(self.bar.symbols)], np.int64)
         if self.bar.payload == "messages":
-            repeated: NDArray[np.int64] = self._cycle[packet % len(self._cycle)]
-            return repeated
+            return np.asarray(self._cycle[packet % len(self._cycle)])
         rng = np.random.default_rng([self.payload_seed, 2, packet])
         if self.bar.payload == "data":
             part = rng.bytes(self._coder.block_bytes - HEADER_BYTES)
             message = Message(Kind.DATA, self._transmitter_id, packet, part)
-            one: NDArray[np.int64] = encode_messages([message], self._coder)[0]
-            return one
+            return np.asarray(encode_messages([message], self._coder)[0])
         book = self.link.codebook
         return rng.integers(0, book.data_symbols, (self.link.packet.frames, book.clusters))
 

@@ -62,8 +62,7 @@ class Vibration:
         scale = self.amplitude_rad_s / (2 * math.pi * self.frequency_hz)
         t_s = np.asarray(t_us, np.float64) * 1e-6
         phase = 2 * math.pi * self.frequency_hz[:, :, None] * t_s + self.phase[:, :, None]
-        angles: Floats = (scale[:, :, None] * np.sin(phase)).sum(1)
-        return angles
+        return np.asarray((scale[:, :, None] * np.sin(phase)).sum(1))
 
 
 class CameraPath:
@@ -110,8 +109,7 @@ def pothole_angle_rad(motion: MotionSpec, t_us: ArrayLike) -> Floats:
     after = np.maximum(t_s[:, None] - np.array(motion.pothole_s), 0.0)
     turn = 2 * math.pi * motion.pothole_hz
     ringing: Floats = np.sin(turn * after) * np.exp(-after / motion.pothole_decay_s)
-    total: Floats = motion.pothole_rad_s / turn * ringing.sum(1)
-    return total
+    return np.asarray(motion.pothole_rad_s / turn * ringing.sum(1))
 
 
 def _read_path(path: Path, duration_s: float) -> CubicSpline:

@@ -97,5 +97,4 @@ def tabulate_strip(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> 
     right, left, before = np.split(steps, [nodes + 1, 2 * nodes + 2], axis=1)
     across = right - left
     along = np.concatenate([before, np.full((len(before), 1), 0.5), 1 - before[:, ::-1]], axis=1)
-    table: Floats = (across * blur.share[:, None]).T @ along
-    return table
+    return np.asarray((across * blur.share[:, None]).T @ along)

@@ -629,8 +629,7 @@ class Simulation:
 def _shift_requests(words: NDArray[np.int64], later_us: float) -> NDArray[np.int64]:
     # Requests that have waited for very long keep a time that fits into a word.
     ticks = np.maximum((words >> _kernels.CODE_BITS) - int(later_us * _kernels.TICKS), -(1 << 35))
-    shifted: NDArray[np.int64] = ticks << _kernels.CODE_BITS | words & ((1 << _kernels.CODE_BITS) - 1)
-    return shifted
+    return np.asarray(ticks << _kernels.CODE_BITS | words & ((1 << _kernels.CODE_BITS) - 1))
 
 
 class _Readout:
