@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import pytest
 from pydantic import Field
 
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, name_place
 from evlcp_sdk.specs import SpecError, build_spec, parse_toml, parse_value
 
 
@@ -43,9 +43,9 @@ class Outer:
     ],
 )
 def test_a_fault_is_one_line_with_path_value_and_what_was_expected(table, message) -> None:
-    with pytest.raises(SpecError) as caught:
+    with pytest.raises(ConfigError) as caught, name_place("f.toml: "):
         build_spec(Outer, {"count": 1} | table if table else {})
-    (line,) = caught.value.lines("f.toml: ")
+    (line,) = str(caught.value).splitlines()
     assert line.startswith(f"f.toml: {message}")
     assert caught.value.exit_code == 2
 
