@@ -166,13 +166,14 @@ def find_bar(
         along the rows; its line, float64 (5,), as for `_kernels.read_rows`; and which clusters are seen.
     """
     selected, grid, sums, offset_px = view.presence.selected, view.presence.grid_px, view.sums, view.offset_px
-    cells = np.array(np.unravel_index(np.flatnonzero(selected), selected.shape), np.float64)
-    seen = np.bincount(cells[0].astype(np.int64), minlength=len(selected)) > 0
-    if seen.sum() < 3:
+    cluster, row, column = np.unravel_index(np.flatnonzero(selected), selected.shape)
+    seen = np.bincount(cluster, minlength=len(selected)) > 0
+    if np.count_nonzero(seen) < 3:
         return None
-    mean = cells.mean(1)
+    cells = np.array((cluster, row, column), np.float64)
+    mean = np.add.reduce(cells, 1) / len(row)
     off = cells - mean[:, None]
-    moments = (off @ off.T / cells.shape[1]).tolist()
+    moments, mean = (off @ off.T / len(row)).tolist(), mean.tolist()
     along, across = (1, 2) if moments[1][1] >= moments[2][2] else (2, 1)
     if moments[along][along] == 0:
         return None
