@@ -657,10 +657,9 @@ def leds(
     For example: [bold]evlcp board leds leds.bin --chips chips.npy[/]
     """
     played = host.led_record.LedRecord.read(record).select_chips()
+    clusters = None if per_led else sdk.resolve.load_link(link_file, overrides or []).bar.led_clusters()
     with name_place(f"{record}: ", InputError):
-        table = played.chips(
-            None if per_led else sdk.resolve.load_link(link_file, overrides or []).bar.led_clusters()
-        )
+        table = played.chips(clusters)
     with Outputs() as outputs:
         outputs.write_array(table, chips)
         outputs.write_array(played.ticks, chips.with_suffix(".ticks.npy"))
