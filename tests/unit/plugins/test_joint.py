@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from evlcp_joint import _kernels
-from evlcp_joint.ranging import JointScaleRanging, boundary_profile
+from evlcp_joint.ranging import JointScaleRanging, boundary_profile, find_bar
 from numpy.testing import assert_allclose
 from scipy.stats import norm
 
@@ -91,6 +91,19 @@ def test_it_stands_tilt_motion_and_damage(how):
     found = measure(view_of(50.0, **how))
     assert found.distance_m == pytest.approx(50, rel=4e-3)
     assert found.pairs == (13 if "dark" in how else 15)
+
+
+@pytest.mark.parametrize(("tilt", "read_tilt"), [(0.0, 0.0), (0.003, 0.0), (0.1, 0.1), (-0.2, -0.2)])
+@pytest.mark.parametrize("across", [False, True])
+def test_its_line_is_that_of_its_cells_and_upright_to_a_pixel(tilt, read_tilt, across):
+    _, _, (first, spacing, _, slope, _), seen = find_bar(view_of(50.0, tilt=tilt, across=across), 32)
+    # From the first cluster's middle on, and as long as its projection.
+    step = LINK.camera.focal_px * 0.06 / 50 / np.hypot(1, tilt)
+    assert spacing == pytest.approx(step, rel=0.01)
+    assert first == pytest.approx(int(step * K / 2 + 8) - 0.5 + 0.3 - step * (K - 1) / 2, abs=1)
+    assert slope == pytest.approx(read_tilt, abs=0.01)
+    assert (slope == 0) == (read_tilt == 0)
+    assert seen.all()
 
 
 def test_unknown_symbols_leave_the_pilot_of_their_clusters():
