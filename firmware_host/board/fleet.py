@@ -113,8 +113,9 @@ def read_entries(path: Path) -> tuple[FleetEntry, ...]:
         ConfigError: The inventory cannot be read, or a value is wrong; the message names the place, the value
             and what was expected.
     """
+    table = read_toml(path)
     with name_place(f"{path}: "):
-        tables = build_spec(_Tables, read_toml(path))
+        tables = build_spec(_Tables, table)
     entries = []
     for i, row in enumerate(tables.board):
         with name_place(f"{path}: board[{i}]: "):

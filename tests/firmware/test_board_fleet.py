@@ -135,6 +135,7 @@ def test_wrong_inventory_is_one_line(evlcp, tmp_path, text, code, expected):
     file.write_text(text)
     done = evlcp("board", "program", "--inventory", file)
     check_fault(done, code, f"evlcp: {file}: ", expected)
+    assert done.err.count(f"{file}: ") == 1
     assert done.out == ""
 
 
