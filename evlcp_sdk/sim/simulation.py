@@ -334,7 +334,6 @@ class Simulation:
         self.counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
         self.done_s = 0.0
         self._footprints: dict[int, _Footprint] = {}
-        self._poses = self._sample_poses()
 
     def stream(self) -> Iterator[Events]:
         """Yield the events in order of time, in pieces of up to a block."""
@@ -343,15 +342,15 @@ class Simulation:
             (number, number * _BLOCK_US, min((number + 1) * _BLOCK_US, end_us))
             for number in range(math.ceil(end_us / _BLOCK_US))
         ]
-        readout = _Readout(self)
+        readout, poses = _Readout(self), self._sample_poses()
         # While the pixels of a block run, the next is prepared, and the events of the last are read out.
         with ThreadPoolExecutor(self._threads) as pool:
-            prepared = pool.submit(self._prepare_block, *spans[0])
+            prepared = pool.submit(self._prepare_block, poses, *spans[0])
             served: Future[Events] | None = None
             for number, begin, end in spans:
                 block = prepared.result()
                 if end < end_us:
-                    prepared = pool.submit(self._prepare_block, *spans[number + 1])
+                    prepared = pool.submit(self._prepare_block, poses, *spans[number + 1])
                 running = [pool.submit(job) for job in self._make_jobs(block, begin, end)]
                 # The caller handles the events while the pixels run.
                 if served is not None:
@@ -480,11 +479,13 @@ class Simulation:
         halos = [halo.cluster_shares(cuts_px) for halo in self._halos]
         return _Footprint(depth_m, blur, near, scale, z, light * across, light * along, halos)
 
-    def _prepare_block(self, number: int, begin_us: float, end_us: float) -> _Block | None:
-        """Prepare a block: the sources' places and switching, and the pixels that they may excite."""
+    def _prepare_block(
+        self, sampled: Iterator[tuple[Floats, ...]], number: int, begin_us: float, end_us: float
+    ) -> _Block | None:
+        """Prepare the block of the next poses: sources, their switching, and the pixels they may excite."""
         scene = self.scene
         camera, sensor = scene.camera, scene.sensor
-        starts, position, attitude = next(self._poses)
+        starts, position, attitude = next(sampled)
         turn = np.stack([attitude[:, 0], -attitude[:, 1]], 1) * camera.focal_px
         wiped = wiper_switches(scene.wiper, begin_us, end_us)
         changed = background_switches(scene.background, begin_us, end_us)

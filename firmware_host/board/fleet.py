@@ -126,7 +126,7 @@ def read_entries(path: Path) -> tuple[FleetEntry, ...]:
             value = getattr(entry, key)
             if value in first and not value.startswith("native:"):
                 raise ConfigError(
-                    f"{path}: board[{i}].{key} = {format_value(value)},"
+                    f"{path}: board[{i}]: {key} = {format_value(value)},"
                     f" expected another than board[{first[value]}]'s"
                 )
             first[value] = i

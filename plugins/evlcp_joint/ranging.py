@@ -157,7 +157,7 @@ class JointScaleRanging(Ranging):
 def find_bar(
     view: FrameView, chips: int
 ) -> tuple[NDArray[np.int16], Floats, Floats, NDArray[np.bool_]] | None:
-    """Find a bar in the cells of a frame; None with fewer than three clusters in line.
+    """Find a bar in the cells of a frame; None with fewer than three clusters, or all in one place.
 
     Its line is that of least squares through all cells.
 
@@ -173,7 +173,7 @@ def find_bar(
     cells = np.array((cluster, row, column), np.float64)
     mean = np.add.reduce(cells, 1) / len(row)
     off = cells - mean[:, None]
-    moments, mean = (off @ off.T / len(row)).tolist(), mean.tolist()
+    moments, centre = (off @ off.T / len(row)).tolist(), mean.tolist()
     along, across = (1, 2) if moments[1][1] >= moments[2][2] else (2, 1)
     if moments[along][along] == 0:
         return None
@@ -185,8 +185,9 @@ def find_bar(
     if abs(tilt) * math.sqrt(12 * moments[along][along]) * grid < 1:
         # Upright to a pixel: all rows are read from the same columns.
         tilt = 0.0
-    first, left, middle = mean[along] - spacing * mean[0], mean[across] - tilt * mean[along], (grid - 1) / 2
+    first, left = centre[along] - spacing * centre[0], centre[across] - tilt * centre[along]
     # In pixels, where a cell's number is that of its middle.
+    middle = (grid - 1) / 2
     line = [first * grid + middle, spacing * grid, left * grid + middle * (1 - tilt), tilt, wide * grid / 2]
     return to_kernel_array(sums[:chips]), to_kernel_array(offset_px[1, :chips]), np.array(line), seen
 

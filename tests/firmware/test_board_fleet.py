@@ -121,7 +121,7 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards, tmp_path):
         (GOOD + 'link = {modulation = {id = "wh9"}}', 2, "board[0]: link: no modulation algorithm named"),
         (GOOD + 'link = "no.toml"', 2, "no.toml: cannot be read"),
         (GOOD + "link = {air = {chip_rate_hz = 2e6}}", 2, "board[0]: the driver board cannot play this link"),
-        (GOOD + GOOD, 2, 'board[1].id = "a", expected another than board[0]\'s'),
+        (GOOD + GOOD, 2, 'board[1]: id = "a", expected another than board[0]\'s'),
         (BOARD + 'payload = "no.json"', 3, "no.json: cannot be read"),
         (BOARD + 'text = "a"', 2, "a message needs sequence"),
         (GOOD + 'key = "k.pem"', 2, "key and user belong to a beacon"),

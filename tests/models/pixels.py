@@ -57,7 +57,7 @@ def pixel_events(sensor, edge_us, light_w_m2, end_us, *, pixels=1, seed=0):
         bars=(),
     )
     simulation = Simulation(scene)
-    prepared = simulation._prepare_block(0, 0.0, 1000.0)
+    prepared = simulation._prepare_block(simulation._sample_poses(), 0, 0.0, 1000.0)
     assert prepared is not None
     active, (_, strips, halos, near, scenery) = prepared
     number = np.arange(pixels, dtype=np.int32)

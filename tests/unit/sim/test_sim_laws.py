@@ -29,7 +29,7 @@ SHORT = replace(load_scene("two-bars"), duration_s=0.03, lamps=(LampSpec(x_m=-1.
 def test_what_is_worked_out_anew_less_often_changes_next_to_no_event(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = load_scene("drive-30kmh", {"motion.distance_m": 30.0, "duration_s": 0.04})
     simulated = Simulation(scene)
-    block = simulated._prepare_block(0, 0.0, 4000.0)
+    block = simulated._prepare_block(simulated._sample_poses(), 0, 0.0, 4000.0)
     # Pixels far beside the strip are most of them and see only every second to eighth pose.
     assert set(block[0].strides.tolist()) == {1, 2, 4, 8}
     coarse = every(scene)
