@@ -9,7 +9,7 @@ times there is none.
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -194,7 +194,8 @@ class LightSurvey:
         # A cell may be missing in between, where the light of several clusters meets.
         labels, _ = ndimage.label(ndimage.binary_dilation(found, np.ones((2, 2), np.bool_)), np.ones((3, 3)))
         sources = []
-        for label, place in enumerate(ndimage.find_objects(labels), 1):
+        places: list[Any] = ndimage.find_objects(labels)
+        for label, place in enumerate(places, 1):
             inside = (labels[place] == label) & found[place]
             times = self._intervals[place][inside].sum(0, dtype=np.int64)
             if times.sum() < _MIN_SOURCE_RISES:
@@ -223,7 +224,8 @@ class LightSurvey:
         largest = 1 + int(np.argmax(ndimage.sum_labels(events, labels, range(1, areas + 1))))
         if (labels == largest).sum() < _MIN_BUSY_CELLS:
             return None
-        return self._pixel_box(ndimage.find_objects(labels)[largest - 1])
+        places: list[Any] = ndimage.find_objects(labels)
+        return self._pixel_box(places[largest - 1])
 
     def _find_cells(self) -> tuple[Floats, NDArray[np.bool_]]:
         """Frequency of each cell, and whether it is significant."""

@@ -306,8 +306,8 @@ class WhitenedView:
         sigma = math.hypot(math.radians(view.attitude_sigma_deg), vibration_rad)
         if rotation is None:
             seen_at = np.column_stack([camera.undistort(points), np.ones(len(points))])
-            directions = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (enu - view.enu_m, seen_at)]
-            rotation, sigma = Rotation.align_vectors(*directions)[0].as_matrix(), _FREE_SIGMA_RAD
+            to, at = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (enu - view.enu_m, seen_at))
+            rotation, sigma = Rotation.align_vectors(to, at)[0].as_matrix(), _FREE_SIGMA_RAD
         camera_at = view.enu_m, view.position_sigma_m, rotation, sigma
         return cls(enu, points, block_diag(*whiten), numbers, arms, curves, bar_sigmas, *camera_at)
 

@@ -206,7 +206,8 @@ def plan_film(
     left, top, right, bottom = 0, 0, camera.width, camera.height
     boxes = [*map(_box_of_frame, footage.frames)] or [*map(_box_of_region, footage.regions)]
     if boxes and not whole:
-        low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
+        corners = np.array(boxes)
+        low, high = corners[:, 0].min(0), corners[:, 1].max(0)
         middle, size = (low + high) / 2, high - low
         # With room for symbols beside a bar and its distance above.
         columns, rows = size + 2 * max(8.0, 0.15 * float(size.max()))

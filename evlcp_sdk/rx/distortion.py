@@ -218,9 +218,9 @@ def fit_straight(place: Floats, off_px: Floats, noise_px: float, steepest_px: fl
         return None
     sigma_px = math.sqrt(squares / (n - 2))
     if are_correlated(residuals):
-        slope, variance = _fit_smooth(terms[:, 1:], residuals, noise_px, sigma_px)
+        smooth, variance = _fit_smooth(terms[:, 1:], residuals, noise_px, sigma_px)
         variance += _SCALE_SQUARE * squares / float(lever @ lever)
-        return StraightFit(float(line[0]) + slope, variance, residuals, is_correlated=True)
+        return StraightFit(float(line[0]) + smooth, variance, residuals, is_correlated=True)
     one, other = np.triu_indices(n, 1)
     slope = (residuals[other] - residuals[one]) / (lever[other] - lever[one])
     residuals_of_lines = residuals - (residuals[one] - slope * lever[one])[:, None] - slope[:, None] * lever

@@ -369,9 +369,9 @@ class _SpotDetector:
         slots = int(slot.max()) + 1
         index = (slot * cells + row) * cells + column
         # Events and ON events by blocks of 2 x 2 cells.
-        every, ones = (np.bincount(some, minlength=slots * cells * cells) for some in (index, index[on]))
-        every, ones = (counts.reshape(slots, cells, cells) for counts in (every, ones))
-        every, ones = (counts[:, :-1] + counts[:, 1:] for counts in (every, ones))
+        shape = slots, cells, cells
+        cubes = (np.bincount(some, minlength=math.prod(shape)).reshape(shape) for some in (index, index[on]))
+        every, ones = (counts[:, :-1] + counts[:, 1:] for counts in cubes)
         every, ones = (counts[..., :-1] + counts[..., 1:] for counts in (every, ones))
         excess = np.abs(2 * ones - every)
         excess[excess < _MIN_PURITY * every] = 0
