@@ -162,13 +162,15 @@ def _serve(
             servers[kind] = sdk.tcp_output.TcpOutput(
                 publisher, gpsd=kind == "gpsd", port=port, clock_zero=clock
             )
-    with sdk.server.serve(publisher, servers.values(), recorder) if servers else nullcontext():
-        for kind, server in servers.items():
-            print_stderr(f"{_SERVED[kind]} at {server.url}")
-        yield
-    for server in servers.values():
-        if server.dropped:
-            print_stderr(f"{server.url}: {server.dropped} results were not sent, as clients were too slow")
+    try:
+        with sdk.server.serve(publisher, servers.values(), recorder) if servers else nullcontext():
+            for kind, server in servers.items():
+                print_stderr(f"{_SERVED[kind]} at {server.url}")
+            yield
+    finally:
+        for server in servers.values():
+            if missed := server.dropped:
+                print_stderr(f"{server.url}: {missed} results were not sent, as clients were too slow")
 
 
 def _exit_code(summary: dict[str, Any], interrupted: Path | None) -> int:

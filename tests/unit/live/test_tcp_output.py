@@ -11,6 +11,7 @@ import pynmea2
 import pytest
 
 from evlcp_sdk.cli.live import ServingOptions, _serve
+from evlcp_sdk.errors import InterruptedRunError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.live import Publisher
 from evlcp_sdk.live.server import Server, serve
@@ -76,8 +77,10 @@ def test_a_client_that_stalls_or_leaves_costs_nothing(served: tuple[Publisher, d
 
 def test_the_command_reports_what_slow_clients_missed(monkeypatch, capsys) -> None:
     monkeypatch.setattr(TcpOutput, "dropped", 3)
-    with _serve(ServingOptions(nmea_port=0), Publisher(), [load_link()], "a.raw", None, None, None):
+    serving = _serve(ServingOptions(nmea_port=0), Publisher(), [load_link()], "a.raw", None, None, None)
+    with suppress(InterruptedRunError), serving:
         served = capsys.readouterr().err
+        raise InterruptedRunError
     assert served.startswith("evlcp: NMEA at ")
     url = served.split()[-1]
     assert capsys.readouterr().err == f"evlcp: {url}: 3 results were not sent, as clients were too slow\n"
