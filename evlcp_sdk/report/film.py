@@ -119,9 +119,10 @@ def check_film(out: Path, for_ms: float, slow: float) -> FilmKind:
         raise ConfigError(f"{out}: a film is written as {' or '.join(f'NAME{end}' for end in FILM_KINDS)}")
     if kind == "MP4":
         import_extra("av", "mp4", str(out))
-    if (pictures := count_pictures(for_ms, slow)) > MAX_PICTURES:
+    pictures = for_ms * 1e-3 * PICTURES_PER_S * slow - 1e-9
+    if not pictures <= MAX_PICTURES:
         raise ConfigError(
-            f"{for_ms:g} ms at 1/{slow:g} would be {pictures} pictures, at most {MAX_PICTURES}: show less,"
+            f"{for_ms:g} ms at 1/{slow:g} would be {pictures:g} pictures, at most {MAX_PICTURES}: show less,"
             " or faster"
         )
     return kind

@@ -1,6 +1,7 @@
 """Films: what a picture shows, event by event; what is shown of a recording; what cannot be."""
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -148,6 +149,7 @@ def test_what_cannot_be_filmed(demo_raw: Path, tmp_path: Path) -> None:
     large: dict[str, Any] = {"for_ms": 50, "whole": True, "longest_px": 1280}
     for message, recording, file, given in (
         ("100 ms at 1/400 would be 1000 pictures, at most 500", demo_raw, out, {"for_ms": 100}),
+        ("20 ms at 1/inf would be inf pictures", demo_raw, out, {"slow": math.inf}),
         ("500 pictures of 1280 x 740 px are 474 megapixels, at most 160", demo_raw, out, large),
         ("a film needs a file", "-", out, {}),
         ("a.avi: a film is written as NAME.webp or NAME.gif or NAME.mp4", few, tmp_path / "a.avi", {}),
