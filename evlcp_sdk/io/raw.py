@@ -7,7 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from io import RawIOBase
+from io import FileIO, RawIOBase
 from pathlib import Path
 from typing import Any, Final
 
@@ -199,13 +199,13 @@ class RawSource(EventSource):
     _gives_bits = True
 
     def __init__(self, path: Path | str, file: RawIOBase | ChunkReader | None = None) -> None:
-        self.path = Path(path)
+        self.path = Path(path) if file is None else path
         self._buffer = np.empty(2 * _kernels.LOOKAHEAD_BYTES, np.uint8)
         self._position = 0  # byte offset in the file of the first byte not decoded
         self._start = self._end = 0  # the bytes of the buffer not decoded
         self._exhausted = False
         try:
-            self._file = self.path.open("rb", buffering=0) if file is None else file
+            self._file = FileIO(path) if file is None else file
             self._descriptor: int | None = getattr(self._file, "fileno", lambda: None)()
             status = None if self._descriptor is None else os.fstat(self._descriptor)
         except OSError as error:

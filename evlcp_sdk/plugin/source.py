@@ -95,7 +95,7 @@ class EventSource(ABC):
 
     def __init__(
         self,
-        path: Path,
+        path: Path | str,
         format: str,
         width: int | None = None,
         height: int | None = None,
