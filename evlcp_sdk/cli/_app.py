@@ -5,7 +5,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from inspect import cleandoc
 from typing import Annotated, Any
 
@@ -173,16 +173,17 @@ def run() -> None:
     from evlcp_sdk.errors import PluginWarning
 
     show_other = warnings.showwarning
+    # Every registry of the process repeats it; Python's own filter forgets when a library changes it.
+    print_once = cache(print_stderr)
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
         if issubclass(category, PluginWarning):
-            print_stderr(f"warning: {message}")
+            print_once(f"warning: {message}")
         else:
             show_other(message, category, *place, **more)
 
     with warnings.catch_warnings(), log_on_stderr():
-        # Once: every registry of the process repeats it.
-        warnings.simplefilter("default", PluginWarning)
+        warnings.simplefilter("always", PluginWarning)
         warnings.showwarning = show
         silence_matplotlib()
         module = "".join(sys.argv[1:2]).replace("-", "_")

@@ -1,6 +1,7 @@
 """Plugins found by name: what is refused and how it is said, and what listing them must not import."""
 
 import json
+import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import entry_points
@@ -81,6 +82,8 @@ def brings_mine() -> Iterator[Algorithm]:
 
 
 def missing() -> object:
+    with warnings.catch_warnings():  # as libraries do, which makes Python forget what it has shown
+        pass
     raise ModuleNotFoundError("No module named 'camera_driver'")
 
 
