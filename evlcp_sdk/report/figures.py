@@ -4,7 +4,6 @@ A bounded share of the data is kept as it comes, so that recordings of any lengt
 """
 
 import math
-from collections.abc import Mapping
 from textwrap import fill
 from typing import Any
 
@@ -88,7 +87,7 @@ class Figures(ChartSink):
         times, box = self.regions.get(region.id, (0, box_of(region)))
         self.regions[region.id] = times + 1, bounding_box([box, box_of(region)])
 
-    def finish(self) -> Mapping[str, Any]:
+    def finish(self) -> None:
         """Draw the figures."""
         name = self.run.name
         self._save(draw_regions(self, name), "regions.png")
@@ -102,7 +101,6 @@ class Figures(ChartSink):
             self._save(
                 draw_plots(plots, f"{name}: {format_count(len(points), 'position')} shown"), "track.png"
             )
-        return {}
 
     def _save(self, figure: Figure, name: str) -> None:
         figure.savefig(self.folder.path(name), format="png", dpi=_DPI)

@@ -1,7 +1,7 @@
 """`fixes.geojson`: fixes and bars as points, the smoothed trajectory as lines."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from evlcp_sdk.formatting import round_or_none
@@ -49,7 +49,7 @@ class GeoJson(Sink):
         for line in self._trail.lines(settled):
             self._write_feature("LineString", line, {"track": "smoothed"})
 
-    def finish(self) -> Mapping[str, Any]:
+    def finish(self) -> None:
         """Write the bars, and end the file."""
         assert self.run.navigator is not None
         for number, site in self.run.navigator.positioner.bars.known_sites.items():
@@ -59,7 +59,6 @@ class GeoJson(Sink):
                 {"bar": number, "transmitter_id": site.transmitter_id},
             )
         self._file.write("]}\n")
-        return {}
 
     def _write_feature(self, kind: str | None, coordinates: list[Any], properties: dict[str, Any]) -> None:
         geometry = None if kind is None else {"type": kind, "coordinates": coordinates}

@@ -76,9 +76,8 @@ class Sink:
     def settle(self, settled: Sequence[Settled]) -> None:
         """Take the next smoothed fixes: all that are given, in order of time, many at a time."""
 
-    def finish(self) -> Mapping[str, Any]:
-        """Write the rest; return this sink's part of the summary's `sinks`, as JSON values."""
-        return {}
+    def finish(self) -> Mapping[str, Any] | None:
+        """Write the rest; return this sink's part of the summary's `sinks`, as JSON values, or None."""
 
     def conclude(self, summary: Mapping[str, Any]) -> None:
         """Take the summary, all but its `files`, and write what depends on it; called last."""

@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Mapping
 from importlib import import_module
 from itertools import pairwise
 from typing import Any
@@ -108,12 +107,11 @@ class Mcap(Sink):
         how.x, how.y, how.z, how.w = turn.tolist()
         self._write_message("/pose", fix.t_us, pose)
 
-    def finish(self) -> Mapping[str, Any]:
+    def finish(self) -> None:
         """Write the last picture and regions, and the file's index."""
         self._write_picture()
         self._write_regions()
         self._writer.finish()
-        return {}
 
     def _write_location(
         self, topic: str, t_us: float, place: tuple[float, float, float], covariance_m2: NDArray[np.float64]

@@ -3,9 +3,8 @@
 Altitudes in KML are above mean sea level, the geoid of EGM96.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, timedelta
-from typing import Any
 from xml.sax.saxutils import escape
 
 from evlcp_sdk.place.gnss import geoid_m
@@ -59,14 +58,13 @@ class Kml(Sink):
                 f"<coordinates>{where}</coordinates></LineString>"
             )
 
-    def finish(self) -> Mapping[str, Any]:
+    def finish(self) -> None:
         """Write the bars, and end the file."""
         assert self.run.navigator is not None
         for number, site in self.run.navigator.positioner.bars.known_sites.items():
             where = _format_point(site.longitude_deg, site.latitude_deg, site.height_m)
             self._write_placemark(f"<name>bar {number}, id {site.transmitter_id}</name>{where}")
         self._file.write("</Document></kml>\n")
-        return {}
 
     def _write_placemark(self, content: str) -> None:
         self._file.write(f"<Placemark>{content}</Placemark>\n")

@@ -1,7 +1,6 @@
 """`navsat.mcap`: fixes as a bag of ROS 2, `sensor_msgs/NavSatFix`."""
 
-from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -49,7 +48,6 @@ class NavSat(Sink):
         )
         self._bag.write(TOPIC, message, stamp_ns)
 
-    def finish(self) -> Mapping[str, Any]:
+    def finish(self) -> None:
         """Write the file's index."""
         self._bag.finish()
-        return {}

@@ -1,7 +1,6 @@
 """`frames.parquet`: the rows of `frames.csv` with their types."""
 
 import json
-from collections.abc import Mapping
 from typing import Any
 
 from evlcp_sdk.formatting import value_or_none
@@ -47,9 +46,8 @@ class FramesParquet(Sink):
         self._writer.write_table(pyarrow.json.read_json(pyarrow.BufferReader(lines), parse_options=options))
         self._waiting = []
 
-    def finish(self) -> Mapping[str, Any]:
+    def finish(self) -> None:
         """Write the last group and the file's end."""
         if self._waiting:
             self._flush()
         self._writer.close()
-        return {}
