@@ -60,6 +60,8 @@ function takeNews(news) {
   } else if (news.line === "bars") {
     sites = news.bars;
   } else if (news.line === "status") {
+    // The camera's clock has restarted: times go on from there.
+    if (status && news.t_us < status.t_us) { zero = news.t_us; bins = new Map(); rates = []; }
     status = news;
     rates.push([(news.t_us - zero) / 1e6, news.events_per_s / 1e6]);
     counted.push([news.elapsed_s, shown.frames]);
@@ -320,7 +322,7 @@ function drawWords() {
     }
   }
   const newest = rows.length ? rows[rows.length - 1].t_us : 0;
-  const near = [...distances].filter(([, news]) => news.echo_of === null && news.t_us > newest - 1e6);
+  const near = [...distances].filter(([, news]) => news.echo_of === null && Math.abs(news.t_us - newest) < 1e6);
   for (const [bar, news] of near.sort((a, b) => a[0] - b[0]).slice(-6)) {
     const sigma = news.ranged ? digits(news.ranged.distance_sigma_m, 2) : "-";
     tiles.push(tile(news.link ? `bar ${bar}, ${news.link}` : `bar ${bar}`, meters(news, 2), "m", `± ${sigma} m, quality ${fixed(news.quality, 2)}`));

@@ -77,7 +77,8 @@ class PictureSlot:
             return
         self._recent.append(events)
         end_us = int(events.t_us[-1])
-        while int(self._recent[0].t_us[-1]) <= end_us - WINDOW_US:
+        # Later ones are from before a restart of the camera's clock.
+        while not end_us - WINDOW_US < int(self._recent[0].t_us[-1]) <= end_us:
             self._recent.popleft()
         if not self._requested:
             return

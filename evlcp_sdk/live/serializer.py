@@ -57,7 +57,7 @@ class Serializer:
         picture is cached.
         """
         if self._last_picture[0] != picture.number:
-            latest = [one for one in self._bars.values() if one.t_us > picture.t_us - _BAR_MEMORY_US]
+            latest = [one for one in self._bars.values() if abs(one.t_us - picture.t_us) < _BAR_MEMORY_US]
             self._last_picture = picture.number, _picture_json(picture, latest), encode_png(picture.paint())
         return self._last_picture[1:]
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import socket
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
@@ -19,6 +20,8 @@ _MAX_WAITING: Final = 1000
 _MAX_UNSENT_BYTES: Final = 1 << 18
 """Waiting for a client, besides the kernel's; more is not sent to it, but counted."""
 _MAX_CLIENTS: Final = 32
+_RESTART_US: Final = 1e6
+"""A greater step back of time is a restart of the camera's clock; a fix comes behind its light."""
 _MAX_LINE_BYTES: Final = 4096
 _KERNEL_BYTES: Final = 1 << 16
 """The kernel's buffer for a client, small as its content gets old."""
@@ -28,8 +31,8 @@ class TcpOutput(Server):
     """Serves positions over TCP, on this machine only.
 
     As gpsd's JSON, to clients that request `?WATCH`, or else as NMEA, to every client. Where the UTC of the
-    camera's clock is not known, it is taken once from the computer's clock, as programs that read positions
-    need a time.
+    camera's clock is not known, it is taken from the computer's clock, as programs that read positions need a
+    time: at the first event, and at a restart of the camera's clock.
     """
 
     def __init__(
@@ -38,7 +41,8 @@ class TcpOutput(Server):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._woken = asyncio.Event()
         super().__init__(publisher, _KINDS, _MAX_WAITING, _HOST, port, self._wake)
-        self._gpsd, self._zero = gpsd, clock_zero
+        self._gpsd, self._zero, self._is_given = gpsd, clock_zero, clock_zero is not None
+        self._last_us = math.inf
         self._clients: dict[asyncio.StreamWriter, dict[str, Any]] = {}
         self._newest: dict[str, dict[str, Any]] = {}
 
@@ -66,8 +70,11 @@ class TcpOutput(Server):
                 self._send_fix(news)
 
     def _send_fix(self, news: News) -> None:
-        if self._zero is None:
+        if not news.t_us:
+            return  # A status before the first event.
+        if not self._is_given and news.t_us < self._last_us - _RESTART_US:
             self._zero = datetime.now(UTC) - timedelta(microseconds=news.t_us)
+        self._last_us = news.t_us
         if news.kind != "fix" or not (self._clients or self._gpsd):
             return
         fix, place = news.value.fix, news.value.filtered

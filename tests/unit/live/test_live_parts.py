@@ -106,6 +106,8 @@ def test_a_picture_shows_what_each_pixel_did() -> None:
         cells = np.zeros((720, 1280), np.uint8)
         paint(cells, events[(events.t_us > picture.t_us - 10_000) & (events.t_us <= picture.t_us)])
         assert (picture.paint() == cells).all()
+    slot.add(events_at([5]), 1280, 720, [])
+    assert len(slot._recent) == 1, "the camera's clock has restarted"
 
 
 def test_what_is_shed_and_counted_is_what_lies_outside() -> None:

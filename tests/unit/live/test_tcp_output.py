@@ -13,7 +13,7 @@ import pytest
 from evlcp_sdk.cli.live import ServingOptions, _serve
 from evlcp_sdk.errors import InterruptedRunError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.live import Publisher
+from evlcp_sdk.live import News, Publisher
 from evlcp_sdk.live.server import Server, serve
 from evlcp_sdk.live.tcp_output import TcpOutput
 from tests.unit.live.helpers import dies, publish_fix
@@ -46,6 +46,13 @@ def test_nmea_has_the_time_of_day_where_no_other_is_known(served) -> None:
     assert 0 < (reported[0].replace(tzinfo=UTC) - datetime.now(UTC)).total_seconds() + 60 < n + 60
     assert [(at - reported[0]).total_seconds() for at in reported] == [0, 1, 2]
     assert [float(one.altitude) + float(one.geo_sep) for one in sentences[1::5]] == pytest.approx([60.0] * 3)
+
+
+def test_the_computer_knows_utc_from_the_first_event_on_and_again_at_a_restart() -> None:
+    output = TcpOutput(Publisher(), gpsd=True)
+    for t_us in (0.0, 9e9, 5e6, 4.9e6):
+        output._send_fix(News("status", t_us, None))
+    assert 0 <= (datetime.now(UTC) - output._zero).total_seconds() - 5 < 60
 
 
 def test_a_client_that_stalls_or_leaves_costs_nothing(served: tuple[Publisher, dict[str, Server]]) -> None:

@@ -349,6 +349,8 @@ def test_a_browser_shows_what_the_files_say(demo_raw, tmp_path, monkeypatch) -> 
         assert browser.fits()
         shown = browser.value("[-0.004, -0.5, 0, 12.25, -0].map((v) => digits(v, 2))")
         assert shown == ["0.00", "-0.50", "0.00", "12.25", "0.00"]
+        # The camera's clock restarts.
+        assert browser.value("takeNews({ ...status, t_us: status.t_us - 1 }), rates.length") == 1
         assert not [m for m in browser.faults if m["method"] == "Runtime.exceptionThrown"]
         asked = {url.split("/")[2] for url in browser.requests if not url.startswith("data:")}
         assert asked <= {f"127.0.0.1:{stage.view.port}"}
