@@ -178,7 +178,7 @@ class Board:
 
     def read_bank(self, bank: int, offset: int, length: int) -> bytes:
         """A bank's bytes."""
-        most = self.info.max_payload - protocol.ReadReply.min_bytes()
+        most = self.session.max_payload - protocol.ReadReply.min_bytes()
         end, found = offset + length, list[tuple[int, bytes]]()
         reads = (protocol.ReadRequest(bank, at, min(most, end - at)) for at in range(offset, end, most))
         self.session.call_each(reads, lambda _, reply: found.append((reply.offset, reply.data)))

@@ -49,6 +49,9 @@ _ADVICE: dict[int, str] = {
     Status.HARDWARE_FAULT: "a fault holds the LEDs dark (bits {detail:#x}); see 'evlcp board status'",
 }
 
+_LEAST_PAYLOAD = 128
+"""Payload that every board takes, bytes: the longest request with its seal is shorter."""
+
 _KINDS: dict[int, type[BoardError]] = {
     Status.BAD_CRC: VerifyError,
     Status.FOREIGN_CODEBOOK: IncompatibleError,
@@ -163,9 +166,14 @@ class Session:
             raise NoBoardError(f"{self.name}: no board answers; {advice}")
         if not isinstance(outcome.reply, protocol.HelloReply):
             raise make_refusal(self.name, protocol.Type.HELLO, outcome.status, outcome.detail)
+        if outcome.reply.max_payload < _LEAST_PAYLOAD:
+            raise IncompatibleError(
+                f"{self.name}: takes {outcome.reply.max_payload} bytes of payload, expected at least"
+                f" {_LEAST_PAYLOAD}: no board that this host can use"
+            )
         self.client.session = outcome.reply.session
         self.client.window = max(1, outcome.reply.window)
-        self.max_payload = outcome.reply.max_payload
+        self.max_payload = min(outcome.reply.max_payload, protocol.MAX_PAYLOAD)
         self._agree_on_key(outcome.reply, outcome.token, old_sealer)
         self.client.minor = min(MINOR, outcome.reply.minor)
         return outcome.reply
@@ -190,7 +198,7 @@ class Session:
         start = ((self.client.first + token) & 0xFFFF) - token
         same = old_sealer is not None and old_sealer.challenge == info.challenge
         self.client.sealer = old_sealer if same else Sealer(self.key, info.challenge, start)
-        self.max_payload = info.max_payload - protocol.SEAL_BYTES
+        self.max_payload -= protocol.SEAL_BYTES
 
     def call(self, request: WireRequest[Reply]) -> Reply:
         """Send one request, and return its answer.
@@ -213,7 +221,7 @@ class Session:
         """The status when it fulfils `done`, or the last one after `timeout_s` and a packet."""
         status = self.call(protocol.StatusRequest())
         # older firmware gives frames alone: at most a preamble of 32 chips, and 32 a frame
-        packet_s = (status.packet_chips or 32 + 32 * status.frames) / status.chip_rate_hz
+        packet_s = (status.packet_chips or 32 + 32 * status.frames) / max(1, status.chip_rate_hz)
         end = self.transport.time_s() + timeout_s + packet_s
         while not done(status) and self.transport.time_s() <= end:
             self.transport.read(pause_s)

@@ -13,9 +13,18 @@ from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
 from firmware_host.board.bank import Bank
 from firmware_host.board.session import Session
-from firmware_host.errors import BoardError, LineError
+from firmware_host.board.tables import flag_names
+from firmware_host.errors import BoardError, LineError, RefusedError
 from firmware_host.protocol.client import RequestOutcome
-from firmware_host.protocol.generated.requests import PushRequest, StopRequest
+from firmware_host.protocol.generated.requests import (
+    BoardFault,
+    PushRequest,
+    State,
+    Status,
+    StatusReply,
+    StatusRequest,
+    StopRequest,
+)
 
 DEFAULT_AHEAD = 4
 """Default number of packets on the board, the playing one included."""
@@ -65,6 +74,7 @@ class Stream:
         self._position = (0, 0)
         self.packet_s = template.link.packet.packet_chips / template.chip_rate_hz
         self._last_reply_s = session.transport.time_s()
+        self._set_state_due()
         self._blocked_until_s = self._last_reply_s
         # latest possible start of the newest packet that has begun; the first begins at once
         self._begun_s = self._last_reply_s - self.packet_s
@@ -171,12 +181,14 @@ class Stream:
         self._pause_packet = None
         while self._pieces or self._in_flight:
             self._exchange(self._pulse_s)
+            self._request_position()
         if self._position != (self._next_number, 0):
             raise LineError(f"{self._session.name}: the board's queue lost a packet; send it again")
         self._submit(PushRequest(self._bank, self._next_number, 0, 1, b""))
         while self._in_flight:
             self._exchange(self._pulse_s)
-        self._session.wait_dark((self._next_number - self.begun + 1) * self.packet_s + _DARK_S)
+        left_s = (self._next_number - self.begun + 1) * self.packet_s
+        self._check_state(self._session.wait_dark(left_s + _DARK_S), State.FAULT)
 
     def stop(self) -> None:
         """Go dark after the playing packet; waiting ones are dropped."""
@@ -190,9 +202,29 @@ class Stream:
     # -- requests
 
     def _request_position(self) -> None:
-        """Request the queue's position if there was no reply for long."""
-        if not self._in_flight and self._session.transport.time_s() - self._last_reply_s >= self._pulse_s:
+        """Request the state if no packet has begun for long, or the queue's position without a reply."""
+        now_s = self._session.transport.time_s()
+        if self._in_flight:
+            return
+        if now_s >= self._state_due_s:
+            self._check_state(self._session.call(StatusRequest()), State.FAULT, State.DARK)
+            self._set_state_due()
+        elif now_s - self._last_reply_s >= self._pulse_s:
             self._submit(PushRequest(self._bank, *self._position, 0, b""))
+
+    def _set_state_due(self) -> None:
+        self._state_due_s = self._session.transport.time_s() + self.packet_s + self._pulse_s
+
+    def _check_state(self, status: StatusReply, *wrong: State) -> None:
+        """Raise RefusedError if the board has gone dark, by a fault, its watchdog or another host."""
+        if status.state in wrong:
+            faults = ", ".join(flag_names(BoardFault, status.faults)) or "none"
+            raise RefusedError(
+                f"{self._session.name}: went dark before the stream ended, faults {faults};"
+                " see 'evlcp board status', then stream again",
+                Status.HARDWARE_FAULT,
+                status.faults,
+            )
 
     def _submit(self, request: PushRequest) -> None:
         self._in_flight[self._session.client.submit(request)] = request
@@ -247,6 +279,7 @@ class Stream:
             next_s = self._begun_s + (reply.begun - self.begun) * self.packet_s
             self._begun_s = min(now_s, next_s) if self.begun and reply.underruns == self.underruns else now_s
             self.begun = reply.begun
+            self._set_state_due()
         else:
             # none has begun since
             self._begun_s = max(self._begun_s, now_s - self.packet_s)

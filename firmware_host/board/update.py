@@ -141,6 +141,8 @@ def update_firmware(
             " --confirm', or reset the board until it has left it",
             Status.BUSY,
         )
+    if before.next not in package.images:
+        raise IncompatibleError(f"{session.name}: image {before.next} is its next, expected 1 or 2")
     data = package.images[before.next]
     if len(data) > before.capacity:
         raise RefusedError(

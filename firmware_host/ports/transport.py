@@ -299,7 +299,8 @@ class ReplayTransport(Transport):
                     raise ValueError(f"dir = {event['dir']!r}, expected 'tx' or 'rx'")
                 self._events.append((float(event["t"]), event["dir"], bytes.fromhex(event["hex"])))
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as fault:
-            raise InputError(f"{path}: line {number}: not a trace of the wire: {fault!r}") from fault
+            what = f"{type(fault).__name__}: {fault}"[:200]
+            raise InputError(f"{path}: line {number}: not a trace of the wire: {what}") from fault
         self._time_s = 0.0
         self._sent = 0
 

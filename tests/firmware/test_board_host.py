@@ -5,6 +5,7 @@ import re
 import signal
 import socket
 from contextlib import nullcontext
+from dataclasses import replace
 
 import pytest
 from board_lines import FatalLine, board_on, check_fault, some_bank, well
@@ -13,9 +14,17 @@ from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.monitor import BoardReturned, watch_board
 from firmware_host.board.session import Session
 from firmware_host.board.stream import Stream
-from firmware_host.errors import BoardResetError, LineError, NoBoardError, VerifyError
+from firmware_host.board.update import UpdatePackage, update_firmware
+from firmware_host.errors import BoardResetError, IncompatibleError, LineError, NoBoardError, VerifyError
 from firmware_host.ports.transport import SocketTransport
-from firmware_host.protocol.generated.requests import BoardFault, State, StatusReply, Watchdog
+from firmware_host.protocol.generated.requests import (
+    BoardFault,
+    HelloReply,
+    State,
+    StatusReply,
+    UpdateStatusReply,
+    Watchdog,
+)
 
 
 def test_a_host_that_stays_keeps_the_watchdog_still(device, board):
@@ -91,6 +100,23 @@ def test_a_bank_that_does_not_hold_is_reported(board, monkeypatch):
     with pytest.raises(VerifyError, match="does not hold what was sent") as caught:
         board.program(some_bank(2))
     assert "baud" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("reply", "wrong", "kind"),
+    [
+        (HelloReply, {"max_payload": 1}, IncompatibleError),
+        (StatusReply, {"chip_rate_hz": 0}, VerifyError),
+        (UpdateStatusReply, {"next": 0}, IncompatibleError),
+    ],
+)
+def test_a_board_that_answers_nonsense_is_refused(device, monkeypatch, reply, wrong, kind):
+    unpack = reply.unpack
+    monkeypatch.setattr(reply, "unpack", lambda data: replace(unpack(data), **wrong))
+    with pytest.raises(kind):  # noqa: PT012
+        board = board_on(device)
+        board.program(some_bank())
+        update_firmware(board, UpdatePackage("native", {1: b"x", 2: b"x"}))
 
 
 def test_a_second_host_learns_of_the_first(evlcp, native):

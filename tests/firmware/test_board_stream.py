@@ -60,6 +60,19 @@ def test_packets_follow_without_a_gap(device, link, latency_s, ahead):
     assert not any(device.bench.shown)
 
 
+@pytest.mark.parametrize("fails_at", [0, 8])
+def test_a_board_that_goes_dark_ends_its_stream(device, fails_at):
+    def send(stream):
+        with stream:
+            for n, packet in enumerate(symbols_of(9)):
+                if n == fails_at:
+                    device.bench.health.faults = BoardFault.OVER_TEMPERATURE
+                stream.send(packet)
+
+    with pytest.raises(RefusedError, match="dark before the stream ended, faults over_temperature"):
+        send(board_on(device).stream(LINK, 4))
+
+
 def test_an_empty_queue_is_named_and_shows_the_idle_pattern(device):
     board = board_on(UsbLine(device, 0.001), nonce=1)
     packets = symbols_of(4)
