@@ -1,5 +1,6 @@
 """Messages that a board sends: once, repeatedly, or updated periodically."""
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from math import ceil
@@ -25,7 +26,7 @@ class Content:
 
     Attributes:
         fixed: The constant part: arguments of `make_messages`.
-        text: A text, with `{time}`, `{left}` and `{n}` filled in if it is sent periodically.
+        text: A text; sent periodically, with `{time}`, `{n}` and, for a countdown, `{left}` filled in.
         time: Whether the time is sent.
         ends_s: End of a countdown, seconds since 1970.
         signals: What a traffic light shows before and after it.
@@ -52,9 +53,14 @@ class Content:
         text = self.text
         if text is not None and number is not None:
             text = text.replace("{time}", strftime("%H:%M:%S", gmtime(at_s))).replace("{n}", str(number))
-            text = text.replace("{left}", f"{left_s:.0f}")
+            text = text if self.ends_s is None else text.replace("{left}", f"{left_s:.0f}")
         sequence = self.sequence + (number or 0)
         return make_messages(link, **self.fixed, text=text, other=other, sequence=sequence)
+
+    def unfilled_fields(self, periodic: bool) -> list[str]:
+        """What looks like a field of the text, and is sent as it stands."""
+        filled = {"{time}", "{n}"} if self.ends_s is None else {"{time}", "{n}", "{left}"}
+        return [one for one in re.findall(r"{\w+}", self.text or "") if not (periodic and one in filled)]
 
 
 def choose_site(path: Path, transmitter_id: int | None, option: str) -> BarSite:

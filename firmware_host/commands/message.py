@@ -15,6 +15,7 @@ import typer
 from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, print_result, progress_bar
+from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs, read_bytes
 from evlcp_sdk.signals import stop_on_request
@@ -179,6 +180,11 @@ def message(
     """
     link = sdk.resolve.load_link(link_file, overrides or [])
     made = content.make()
+    if fields := made.unfilled_fields(anew.every is not None):
+        print_stderr(
+            f"--text: {', '.join(fields)} sent as it stands; --every SECONDS fills in {{time}}, {{n}} and,"
+            " with --countdown, {left}"
+        )
     if anew.every is None and anew.count is not None:
         raise ConfigError("--count belongs to --every SECONDS")
     if anew.every is not None:
@@ -197,6 +203,8 @@ def message(
         if not written and not as_json:
             raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
         return
+    if made.time or made.ends_s is not None:
+        print_stderr("--time, --countdown: the board repeats what holds now; --every SECONDS sends it anew")
     with line.open() as opened:
         with progress_bar("programming") as progress:
             done = host.board.provision(

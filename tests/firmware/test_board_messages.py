@@ -204,6 +204,15 @@ def test_a_wrong_line_is_reported(evlcp, tmp_path, text, options, message):
     check_fault(evlcp("board", "stream", file, "--port", "native:", *options), 3, message)
 
 
+def test_what_is_no_field_and_what_does_not_change_is_named(evlcp, tmp_path):
+    message = ("tx", "message", "--text", "{foo} {n} {left}")
+    once, anew = (evlcp(*message, *more).err for more in (("-o", tmp_path / "m"), ("--every", 5)))
+    assert once.startswith("evlcp: --text: {foo}, {n}, {left} sent as it stands; --every")
+    assert anew.startswith("evlcp: --text: {foo}, {left} sent as it stands; --every")
+    done = evlcp("tx", "message", "--countdown", 9, "--port", "native:")
+    assert "the board repeats what holds now; --every SECONDS" in done.err
+
+
 def test_a_message_that_changes(evlcp, native, tmp_path):
     began = time.time()
     options = ("--text", "{n}: {left} s left at {time}", "--time", "--countdown", 100, "--sequence", 40)
