@@ -368,6 +368,11 @@ class Board:
         if not self.info.capabilities & Capability.STREAM:
             raise IncompatibleError(f"{self.session.name}: its firmware has no streams; update the firmware")
         self.check_fits(like)
+        slots = (self.info.bank_bytes - len(like.table)) // like.packet_bytes
+        if ahead >= slots:
+            raise ConfigError(
+                f"ahead = {ahead}, {self.session.name} holds {slots - 1} packets of this length"
+            )
         status = self._wait_until_swapped()
         self._check_rate(like, status)
         if like.rest:
@@ -377,12 +382,7 @@ class Board:
         bank = 1 if status.active_bank == 0 else 0
         if like.content:
             self.write_missing(bank, like.content)
-        request = protocol.StreamRequest(bank, like.format, like.digest)
-        slots = self.session.call(request).slots
-        if ahead >= slots:
-            raise ConfigError(
-                f"ahead = {ahead}, {self.session.name} holds {slots - 1} packets of this length"
-            )
+        self.session.call(protocol.StreamRequest(bank, like.format, like.digest))
         pulse_s = 0.5 if status.watchdog == Watchdog.KEEP else min(0.5, status.watchdog_ms / 3e3)
         stream = Stream(self.session, bank, like, ahead, pulse_s)
         if status.state != State.PLAYING:

@@ -146,6 +146,7 @@ def test_what_a_board_refuses(device, board):
     for ahead, wanted in ((1, "expected 2 or more"), (500, "holds 127 packets")):
         with pytest.raises(ConfigError, match=wanted):
             board.stream(LINK, ahead)
+    assert board.status().active_bank == protocol.NO_BANK
     huge = board_link("air.frames_per_packet=700")
     with pytest.raises(ConfigError, match=r"700 frames takes 22400 bytes.*room for two; .* 640 frames"):
         board.stream(huge)
