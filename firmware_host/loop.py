@@ -154,6 +154,8 @@ def run_loop(
     """
     if not text:
         raise ConfigError("text: expected at least one character")
+    if not link.messages.decode:
+        raise ConfigError("messages.decode = false: expected true, or the text is not read")
     nearest_m = link.bar.length_m * link.camera.focal_px / link.camera.height
     if distance_m < nearest_m:
         raise ConfigError(

@@ -56,7 +56,8 @@ class HostLine:
                 self._server = self._listen(listen)
         except OSError as fault:
             self.close()
-            raise ToolchainError(f"{listen}: no board can listen there: {fault.strerror or fault}") from fault
+            place = f"{listen}, link {link}" if listen == "pty" and link else listen
+            raise ToolchainError(f"{place}: no board can listen there: {fault.strerror or fault}") from fault
 
     def _listen(self, listen: str) -> socket.socket:
         address = socket_address(listen)

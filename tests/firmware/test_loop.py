@@ -57,6 +57,12 @@ def test_a_text_that_does_not_arrive_ends_with_1(evlcp, tmp_path):
         assert all((tmp_path / name).is_file() for name in step["files"])
 
 
+def test_messages_that_are_not_read_are_refused(evlcp, tmp_path):
+    done = evlcp("loop", "--set", "messages.decode=false", "-o", tmp_path)
+    assert (done.code, list(tmp_path.iterdir())) == (2, [])
+    assert done.err.startswith("evlcp: messages.decode = false: expected true")
+
+
 def test_without_a_compiler(evlcp, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
