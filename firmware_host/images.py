@@ -53,8 +53,10 @@ class FlashImage:
             pieces = list(_elf_pieces(path, data))
         elif path.suffix.lower() in (".hex", ".ihex", ".ihx"):
             pieces = list(_hex_pieces(path, data))
-        else:
+        elif path.suffix.lower() == ".bin":
             pieces = [(FLASH_START, data)]
+        else:
+            raise InputError(f"{path}: expected .elf, .hex or .bin; 'evlcp board update' takes .update.json")
         pieces = [(at, piece) for at, piece in pieces if piece]
         if not pieces:
             raise InputError(f"{path}: holds no bytes of a flash; expected a firmware image")

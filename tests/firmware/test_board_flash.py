@@ -46,6 +46,7 @@ def test_files_hold_one_image(evlcp, tmp_path):
         ("a.hex", b":00000009F7\n", "record type 9, expected 0 to 5"),
         ("a.hex", b":0100000001FE\n:00000001FF\n", "expected within the flash"),
         ("a.bin", b"", "holds no bytes"),
+        ("a.update.json", b"{}", "expected .elf, .hex or .bin"),
         ("a.bin", bytes((1 << 20) + 1), "expected within the flash"),
         ("a.elf", b"\x7fELF\x01\x01", "cut off"),
         ("a.elf", b"\x7fELF\x02\x01" + bytes(60), "not one of 32 bits"),
