@@ -117,6 +117,15 @@ class Outputs:
         with writing(target), self.open(target) as file:
             file.write(text)
 
+    def write_bytes(self, data: bytes, target: Path) -> None:
+        """Write a binary file.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        with writing(target), self.open_binary(target) as file:
+            file.write(data)
+
     def write_array(self, array: "NDArray[Any]", target: Path) -> None:
         """Write an array as `.npy` under exactly this name.
 
@@ -128,8 +137,7 @@ class Outputs:
         # NumPy bypasses Python when it writes to a file, which fails on a pipe.
         buffer = io.BytesIO()
         np.save(buffer, array)
-        with writing(target), self.open_binary(target) as file:
-            file.write(buffer.getbuffer())
+        self.write_bytes(buffer.getvalue(), target)
 
     def drop(self, target: Path) -> None:
         """Remove a file of an earlier run when these come into place."""

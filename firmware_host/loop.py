@@ -216,7 +216,7 @@ def _message_step(text: str, message: Message, symbols: NDArray[np.int64], link:
 
 def _light_step(light: EmulatedLight, link: Link, folder: Path) -> Step:
     with Outputs() as outputs:
-        outputs.open_binary(folder / "leds.bin").write(light.record.to_bytes())
+        outputs.write_bytes(light.record.to_bytes(), folder / "leds.bin")
         outputs.write_array(light.chips, folder / _CHIPS)
     leds, chips = len(link.bar.led_clusters()), len(light.chips)
     rate_hz, on_share = round(light.rate_hz, 3), round(float(light.chips.mean()), 4)

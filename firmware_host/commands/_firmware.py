@@ -40,7 +40,7 @@ def build_images(
         output.mkdir(parents=True, exist_ok=True)
     with Outputs() as outputs:
         for path, content in zip(paths, contents.values(), strict=True):
-            outputs.open_binary(path).write(content)
+            outputs.write_bytes(content, path)
     table = {
         "target": target,
         "address": image.address,

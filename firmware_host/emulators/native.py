@@ -85,7 +85,8 @@ class NativeBoard(Transport):
     def close(self) -> None:
         """Switch it off, and close its files."""
         if self._leds is not None:
-            self._leds.close()
+            with writing(self._leds.name):
+                self._leds.close()
 
     def _save_flash(self, held: bytes) -> None:
         """Replace the flash file when the new one is complete; a symbolic link stays.

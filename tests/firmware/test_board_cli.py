@@ -8,12 +8,14 @@ import socket
 import subprocess
 import sys
 import tty
+from pathlib import Path
 
 import numpy as np
 import pytest
 import typer
 from board_lines import Native, check_fault, well
 
+from evlcp_sdk.errors import OutputError
 from firmware_host.board.survey import find_board_port, survey_ports
 from firmware_host.emulators.led_record import RECORD, LedRecord
 from firmware_host.emulators.native import NativeBoard
@@ -304,6 +306,14 @@ def test_an_emulator_leaves_a_users_file_alone(evlcp, tmp_path, option):
     place = f"unix:{path}" if option == "--listen" else path
     assert evlcp("board", "emulate", "native", option, place).code == 1
     assert path.read_text() == "mine"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+def test_a_record_on_a_full_disk_is_named():
+    board = NativeBoard(Path("/dev/full"))
+    for use in (lambda: board.read(0.0), board.close):
+        with pytest.raises(OutputError, match="/dev/full: cannot be written: No space left"):
+            use()
 
 
 def test_a_flash_file_is_as_private_as_it_was(tmp_path):
