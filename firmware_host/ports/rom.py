@@ -76,7 +76,8 @@ class RomLoader:
 
     def _drain(self) -> None:
         self._received.clear()
-        while self.line.read(0.02):
+        end = self.line.time_s() + _ANSWER_S  # another device may never be silent
+        while self.line.read(0.02) and self.line.time_s() < end:
             pass
 
     def _expect_acknowledgement(self, timeout_s: float = _ANSWER_S) -> None:
@@ -89,10 +90,10 @@ class RomLoader:
         self._drain()
         for _ in range(_PIECE + 8):
             self.line.write(b"\xff")
-            if answered := self._read_byte(0.005) is not None:
+            if (answer := self._read_byte(0.005)) is not None:
                 break
         self._drain()
-        return answered
+        return answer in (_ACK, _NACK)
 
     def _run_command(
         self, code: int, what: str, *parts: bytes, count: int = 0, timeout_s: float = _ANSWER_S

@@ -1,11 +1,13 @@
 """The firmware as files, and into a part by its ROM; what is in there then boots on the model."""
 
+import itertools
 import json
 import socket
 import threading
 import time
 from contextlib import suppress
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -56,6 +58,13 @@ def test_damaged_images_are_reported(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=message):
         FlashImage.read(tmp_path / name)
+
+
+def test_a_device_that_is_never_silent_is_no_boot_loader():
+    clock = itertools.count(0.0, 0.01)
+    line = Mock(name="line", time_s=lambda: next(clock), read=lambda _: b"$GPGGA")
+    with pytest.raises(NoBoardError, match="no boot loader answers"):
+        RomLoader(line)
 
 
 def test_flashed_read_back_started_and_the_rest_left_alone():
