@@ -124,7 +124,7 @@ def read_toml(path: Path | str) -> dict[str, Any]:
         ConfigError: The file cannot be read, or is not TOML.
     """
     try:
-        text = read_bytes(path).decode().replace("\r\n", "\n")
+        text = read_bytes(path).decode("utf-8-sig").replace("\r\n", "\n")
     except InputError as fault:
         raise ConfigError(str(fault)) from fault
     except UnicodeDecodeError as fault:
@@ -170,7 +170,7 @@ def parse_value(text: str) -> Any:
     ([1, 2.5], 'joint-scale')
     """
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
+        (value,) = tomllib.loads(f"value = {text}").values()
     except (ValueError, RecursionError):
         return text.strip()
     return text.strip() if _has_long_integer(value) else value

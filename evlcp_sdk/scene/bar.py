@@ -216,10 +216,9 @@ class BarLayout:
         """
         keys = dict(table)
         name = keys.pop("shape", "grid")
-        if name not in SHAPES:
-            near = suggest(name, list(SHAPES)) if isinstance(name, str) else ""
-            problem = f" = {format_value(name)}: expected one of {', '.join(SHAPES)}{near}"
-            raise SpecError([(("shape",), problem)])
+        if not isinstance(name, str) or name not in SHAPES:
+            unknown = f" = {format_value(name)}: unknown shape{suggest(str(name), list(SHAPES))}"
+            raise SpecError([(("shape",), unknown)])
         return cls(build_spec(SHAPES[name], keys)) if table else cls()
 
     @cached_property

@@ -7,7 +7,7 @@ import pytest
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError, name_place
-from evlcp_sdk.specs import SpecError, build_spec, parse_toml, parse_value
+from evlcp_sdk.specs import SpecError, build_spec, parse_toml, parse_value, read_toml
 
 
 @dataclass(frozen=True)
@@ -68,3 +68,9 @@ def test_an_integer_beyond_64_bits_is_a_line(digits: str) -> None:
     (line,) = str(caught.value).splitlines()
     assert len(line) < 250
     assert line.endswith(": expected a valid integer")
+
+
+def test_a_byte_order_mark_and_lines_behind_a_value_lose_nothing(tmp_path) -> None:
+    (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbfb = 3\r\n")
+    assert read_toml(tmp_path / "a.toml") == {"b": 3}
+    assert parse_value("50\ncamera.width = 3") == "50\ncamera.width = 3"

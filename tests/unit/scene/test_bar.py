@@ -146,7 +146,7 @@ LEDS_BEHIND = [[0, 0, 0, 0], [0.1, 0, 0, 1], [0, 0, 0.3, 2]]
         ({"leds_file": "a.csv", "leds": []}, 'link.toml: bar.leds_file = "a.csv": expected it'),
         ({"shape": "ring", "rows": 3}, "link.toml: bar.rows = 3: unknown key"),
         ({"shape": "ring", "cluster_leds": 5}, "bar.cluster_leds = 5: expected a divisor of bar.leds = 12"),
-        ({"shape": 3}, "link.toml: bar.shape = 3: expected one of grid, columns, ring, table"),
+        ({"shape": [3]}, "link.toml: bar.shape = [3]: unknown shape (known: grid, columns, ring, table)"),
         ({"shape": "table", "leds": []}, "bar.leds: 0 LEDs: expected at most 65536 LEDs, and one at least"),
         ({"shape": "table", "leds": [[0, 0, 0, 1]]}, "bar.leds: no LED of cluster 0: expected clusters 0"),
         ({"shape": "table", "leds": LEDS_BEHIND}, "bar.leds: cluster 2 is behind cluster 0, LED by LED: exp"),
