@@ -9,7 +9,7 @@ from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.formatting import suggest
 from evlcp_sdk.plugin.hooks import SinkRecord
-from evlcp_sdk.plugin.registry import Owner, Registry, import_class
+from evlcp_sdk.plugin.registry import Owner, Registry, find_text_fault, import_class
 
 SUMMARY = "summary.json"
 """File of every result that no sink may write."""
@@ -81,10 +81,8 @@ def find_message_kinds(registry: Registry) -> dict[int, MessageKind]:
 
 def _sink_fault(record: SinkRecord, others: Sequence[tuple[SinkRecord, Owner]]) -> str | None:
     """The fault of a sink's record, or its conflict with another one; None if there is none."""
-    for key in ("name", "target", "summary"):
-        value = getattr(record, key)
-        if not (isinstance(value, str) and value):
-            return f"sink {record.name!r}: {key} = {value!r}, expected text"
+    if fault := find_text_fault(record, f"sink {record.name!r}", "name", "target", "summary"):
+        return fault
     files: Any = record.files
     if not isinstance(files, tuple | list) or not all(
         isinstance(name, str) and name not in ("", ".", "..") and not set(name) & {"/", "\\", "\0"}
@@ -106,8 +104,8 @@ def _kind_fault(kind: MessageKind, others: Sequence[tuple[MessageKind, Owner]]) 
     # A class may lack them.
     number, name = getattr(kind, "number", None), getattr(kind, "name", None)
     who = f"message kind {name!r}"
-    if not (isinstance(name, str) and name):
-        return f"{who}: name = {name!r}, expected text"
+    if fault := find_text_fault(kind, who, "name"):
+        return fault
     if not (isinstance(number, int) and 1 <= number <= _LARGEST_KIND):
         return f"{who}: number = {number!r}, expected 7 to {_LARGEST_KIND}"
     if name == "packet":

@@ -334,16 +334,29 @@ def _describe_fault(fault: BaseException) -> str:
     return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
 
 
+def find_text_fault(record: object, who: str, *keys: str) -> str | None:
+    """The first key of a record whose value is no text, as a fault; None if there is none."""
+    for key in keys:
+        value = getattr(record, key, None)
+        if not (isinstance(value, str) and value):
+            return f"{who}: {key} = {value!r}, expected text"
+    return None
+
+
 def _algorithm_fault(record: Algorithm, _others: object) -> str | None:
-    if record.role in ROLES:
-        return None
-    return f"algorithm '{record.id}' has role '{record.role}', expected one of {', '.join(ROLES)}"
+    who = f"algorithm {record.id!r}"
+    if fault := find_text_fault(record, who, "id", "role", "target"):
+        return fault
+    if record.role not in ROLES:
+        return f"{who} has role '{record.role}', expected one of {', '.join(ROLES)}"
+    if not isinstance(record.revision, int):
+        return f"{who}: revision = {record.revision!r}, expected a whole number"
+    return None
 
 
 def _algorithms_of(plugin: Any) -> frozenset[tuple[str, str]]:
     """(role, id) of a broken plugin's algorithms, if it lists them."""
     try:
-        records = list(plugin.evlcp_algorithms())
+        return frozenset((r.role, r.id) for r in plugin.evlcp_algorithms() if isinstance(r, Algorithm))
     except Exception:
         return frozenset()
-    return frozenset((r.role, r.id) for r in records if isinstance(r, Algorithm))

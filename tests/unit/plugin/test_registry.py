@@ -93,6 +93,15 @@ BROKEN: dict[str, tuple[Callable[[], object], str]] = {
         lambda: Brings(ranging("mine"), Algorithm("rangin", "x", "a:B", 1, "")),
         "algorithm 'x' has role 'rangin', expected one of detection, framing, pilots, ",
     ),
+    "list": (
+        lambda: Brings(Algorithm(["ranging"], "mine", "a:B", 1, "")),
+        "role = ['ranging'], expected text",
+    ),
+    "target": (lambda: Brings(Algorithm("ranging", "mine", 3, 1, "")), "target = 3, expected text"),
+    "revision": (
+        lambda: Brings(Algorithm("ranging", "mine", "a:B", "1", "")),
+        "revision = '1', expected a whole",
+    ),
     "record": (lambda: Brings(ranging("mine"), "poc"), "evlcp_algorithms() gave something else than Alg"),
     "nothing": (lambda: plugin(evlcp_algorithms=lambda: None), "evlcp_algorithms() gave"),
     "fails": (
@@ -210,7 +219,7 @@ def test_broken_and_conflicting_plugins_are_listed(monkeypatch: pytest.MonkeyPat
     ("target", "message"),
     [
         ("nowhere:Nothing", "cannot import nowhere:Nothing: ModuleNotFoundError: No module named 'nowhere'"),
-        ("", "cannot import : "),
+        (":", "cannot import :: "),
         ("json:JSONDecoder", "json:JSONDecoder is not a Ranging"),
     ],
 )
