@@ -148,21 +148,22 @@ def explain_fault(fault: BaseException) -> tuple[str, int]:
 
 
 def describe_plugin_fault(fault: BaseException) -> str:
-    """What code of a plugin raised, in one line, with the file and line."""
+    """What code of a plugin raised, in one line, with the file and line, unless these are the SDK's."""
     last = traceback.extract_tb(fault.__traceback__)[-1]
-    line = f"{type(fault).__name__}: {format_safely(str, fault)}".splitlines()[0]
-    return f"{line} ({Path(last.filename).name}, line {last.lineno})"
+    line, file = f"{type(fault).__name__}: {format_safely(str, fault)}".splitlines()[0], Path(last.filename)
+    is_own = file.is_relative_to(Path(__file__).parent)
+    return line if is_own else f"{line} ({file.name}, line {last.lineno})"
 
 
 @contextmanager
-def blame(who: str) -> Iterator[None]:
+def blame(who: str, hint: str = "") -> Iterator[None]:
     """Turn what code of a plugin raises within into a `PluginError` that names it; the SDK's errors pass."""
     try:
         yield
     except EvlcpError:
         raise
     except (Exception, SystemExit) as fault:
-        raise PluginError(f"{who}: {describe_plugin_fault(fault)}") from fault
+        raise PluginError(f"{who}: {describe_plugin_fault(fault)}{hint}") from fault
 
 
 def fault_message(fault: BaseException) -> str:

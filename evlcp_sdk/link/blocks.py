@@ -1,5 +1,7 @@
 """Blocks to packets: protection and interleaving, and back from soft bits."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 
 import numpy as np
@@ -38,18 +40,28 @@ class BlockCoder:
         codebook: The codes that both ends share.
         packet: Lengths of a packet's parts.
         code: The error-correcting code of a packet's bits.
+        name_faults: Makes a context that names the code where it fails.
 
     Raises:
         ConfigError: A packet is too short for a block.
     """
 
-    def __init__(self, codebook: Codebook, packet: PacketFormat, code: Code) -> None:
+    def __init__(
+        self,
+        codebook: Codebook,
+        packet: PacketFormat,
+        code: Code,
+        name_faults: Callable[[], AbstractContextManager[None]] = nullcontext,
+    ) -> None:
         self.codebook = codebook
+        self._name_faults = name_faults
         self._frames = packet.frames
         self._code = code
         self.bits = packet_bits(codebook, packet)
-        if not hasattr(code, "message_bits"):
-            raise TypeError(f"gave {type(code).__name__} at compile(), expected an object with message_bits")
+        if not isinstance(bits := getattr(code, "message_bits", None), int | np.integer):
+            raise TypeError(
+                f"gave {type(code).__name__} with message_bits = {bits!r}, expected a whole number"
+            )
         self.block_bytes = code.message_bits // 8
         if self.block_bytes <= HEADER_BYTES:
             raise ConfigError(
@@ -73,7 +85,11 @@ class BlockCoder:
         message = np.zeros(self._code.message_bits, np.uint8)
         message[: 8 * self.block_bytes] = np.unpackbits(np.frombuffer(block, np.uint8))
         air = np.empty(self.bits, np.uint8)
-        air[self._order] = self._code.encode(message)
+        with self._name_faults():
+            coded = self._code.encode(message)
+            if np.shape(coded) != air.shape or np.max(coded) > 1:
+                raise ValueError(f"gave no {self.bits} bits of 0 and 1 at encode()")
+            air[self._order] = coded
         return air
 
     def decode_block(self, llr: NDArray[np.float32]) -> bytes | None:
@@ -85,11 +101,13 @@ class BlockCoder:
         # Fewer bits than the message has cannot determine it.
         if np.count_nonzero(llr) < self._code.message_bits:
             return None
-        found = self._code.decode(np.ascontiguousarray(llr[self._order], np.float32))
-        if not isinstance(found, Corrected):
-            raise TypeError(f"gave {type(found).__name__}, expected Corrected")
-        if np.shape(found.bits) != (self._code.message_bits,):
-            raise ValueError(f"gave bits of shape {np.shape(found.bits)}, expected {self._code.message_bits}")
-        if not found.ok or found.bits[8 * self.block_bytes :].any():
-            return None
-        return np.packbits(found.bits[: 8 * self.block_bytes]).tobytes()
+        bits = self._code.message_bits
+        with self._name_faults():
+            found = self._code.decode(np.ascontiguousarray(llr[self._order], np.float32))
+            if not isinstance(found, Corrected):
+                raise TypeError(f"gave {type(found).__name__}, expected Corrected")
+            if np.shape(found.bits) != (bits,):
+                raise ValueError(f"gave bits of shape {np.shape(found.bits)}, expected {bits}")
+            if not found.ok or found.bits[8 * self.block_bytes :].any():
+                return None
+            return np.packbits(found.bits[: 8 * self.block_bytes]).tobytes()

@@ -7,16 +7,17 @@ before anything runs, so that the resolved table alone reproduces a result. See 
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, overload
 
 from evlcp_sdk.air.codebook import Codebook, find_unpaired_codes
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
-from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError, UnknownAlgorithmError, name_place
+from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError, blame, name_place
 from evlcp_sdk.formatting import add_check_hint, format_value, suggest
 from evlcp_sdk.link.blocks import BlockCoder, packet_bits
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
@@ -190,9 +191,12 @@ class Link:
 
         Raises:
             ConfigError: A packet is too short for a block.
+            PluginError: The error correction fails; so do the coder's methods.
         """
-        code = self.algorithm("error-correction").compile(packet_bits(self.codebook, self.packet))
-        return BlockCoder(self.codebook, self.packet, code)
+        name_faults = partial(_name_faults, "error-correction", self.table)
+        with name_faults():
+            code = self.algorithm("error-correction").compile(packet_bits(self.codebook, self.packet))
+            return BlockCoder(self.codebook, self.packet, code, name_faults)
 
     def _objects_by_section(self) -> dict[str, Any]:
         return {section: getattr(self, section) for section in _SPECS} | dict(self.algorithms)
@@ -420,11 +424,11 @@ def _assemble_link(
     bar, air = parts["bar"], parts["air"]
     with _name_faults("framing", table):
         codebook = parts["framing"].codebook(bar.clusters)
-        if not isinstance(codebook, Codebook | None):
-            raise TypeError(f"gave {type(codebook).__name__} at codebook(), expected a Codebook")
-        if codebook is not None and codebook.clusters != bar.clusters:
-            raise ValueError(f"gave codes of {codebook.clusters} clusters, expected {bar.clusters}")
-        if codebook is not None:
+        if codebook is not None or not {"pilots", "modulation"} <= parts.keys():
+            if not isinstance(codebook, Codebook):
+                raise TypeError(f"gave {type(codebook).__name__} at codebook(), expected a Codebook")
+            if codebook.clusters != bar.clusters:
+                raise ValueError(f"gave codes of {codebook.clusters} clusters, expected {bar.clusters}")
             _check_alphabet(codebook)
     if codebook is None:
         codebook = _codes_of_roles(parts, table)
@@ -483,16 +487,10 @@ def _list_unpaired_codes(built: Mapping[str, Any]) -> frozenset[str]:
     return frozenset()
 
 
-@contextmanager
-def _name_faults(role: str, table: Mapping[str, Mapping[str, Any]]) -> Iterator[None]:
+def _name_faults(role: str, table: Mapping[str, Mapping[str, Any]]) -> AbstractContextManager[None]:
     """Turn what an algorithm raises within into a `PluginError` that names it."""
-    try:
-        yield
-    except EvlcpError:
-        raise
-    except (Exception, SystemExit) as fault:
-        id, what = table[role]["id"], f"{type(fault).__name__}: {fault}".splitlines()[0]
-        raise PluginError(add_check_hint(f"{role} algorithm '{id}': {what}", role, id)) from fault
+    id = table[role]["id"]
+    return blame(f"{role} algorithm '{id}'", add_check_hint("", role, id))
 
 
 def _parse_override(text: str) -> tuple[str, str, Any]:

@@ -1,7 +1,6 @@
 """Packets to messages: soft bits to blocks, blocks to messages, signatures to trust."""
 
 from collections.abc import Iterable, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -14,7 +13,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.sections import MessageSpec
-from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.trust import BeaconVerifier, TrustVerdict, describe_signature
 from evlcp_sdk.utc import ClockZero, clock_zero_at
 from evlcp_sdk.values import Packet, ReceivedMessage, remember_newest, replace_fields
@@ -94,7 +92,6 @@ class MessageAssembler:
         coder: Decodes the blocks of packets.
         spec: The configuration.
         kinds: The known kinds of messages, by number; blocks of others count as malformed.
-        guard: Names the error correction where it fails.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
 
     Attributes:
@@ -109,11 +106,9 @@ class MessageAssembler:
         coder: BlockCoder,
         spec: MessageSpec,
         kinds: Mapping[int, MessageKind] = BUILT_IN_KINDS,
-        guard: Guard | None = None,
         clock_zero: ClockZero = None,
     ) -> None:
         self._coder = coder
-        self._guard = guard or nullcontext()
         self._kinds = kinds
         self._spec = spec
         self._room = coder.block_bytes - HEADER_BYTES
@@ -132,12 +127,10 @@ class MessageAssembler:
         if not link.messages.decode:
             return None
         try:
-            with Guard(link, "error-correction", may_refuse=True):
-                coder = link.block_coder()
+            coder = link.block_coder()
         except ConfigError:
             return None
-        guard = Guard(link, "error-correction")
-        return cls(coder, link.messages, link.kinds, guard, clock_zero)
+        return cls(coder, link.messages, link.kinds, clock_zero)
 
     def add(self, packet: Packet) -> Packet:
         """Decode a packet; return it with its block and the messages that it completes.
@@ -184,7 +177,7 @@ class MessageAssembler:
 
     def _decode_packet(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:
         """The bytes of a packet's block, None if they are not known yet, and the packets that it took."""
-        content = self._decode_block(llr)
+        content = self._coder.decode_block(llr)
         if content is not None or not self._spec.combine_packets:
             return content, 1
         agreements = [_agreement(llr, earlier.llr) for earlier in inbox.sums]
@@ -195,14 +188,10 @@ class MessageAssembler:
         self.counts["blocks_alike"] += 1
         earlier = inbox.sums.pop(best)
         total = _BlockSum(earlier.llr + llr, earlier.packets + 1)
-        content = self._decode_block(total.llr)
+        content = self._coder.decode_block(total.llr)
         if content is None:
             inbox.sums.append(total)
         return content, total.packets
-
-    def _decode_block(self, llr: NDArray[np.float32]) -> bytes | None:
-        with self._guard:
-            return self._coder.decode_block(llr)
 
     def _add_block(self, inbox: _Inbox, block: Block, packet: Packet) -> list[ReceivedMessage]:
         """Add a block to its message; return what can be delivered now."""

@@ -1,10 +1,13 @@
 """Blocks to packets and back: what is put on air is read, by links of every kind."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from evlcp_sdk.air.frames import bits_of_symbols
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, PluginError
 from evlcp_sdk.link.compose import compose
 from evlcp_sdk.link.resolve import load_link
 
@@ -38,3 +41,23 @@ def test_every_profile_and_length_carries_blocks(overrides: tuple[str, ...]) -> 
 def test_a_text_that_is_not_utf8_is_one_line() -> None:
     with pytest.raises(ConfigError, match="text: character 2 is not UTF-8"):
         compose(text="a\udcff")
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        ({"message_bits": "8"}, r"TypeError: gave SimpleNamespace with message_bits = '8'"),
+        (
+            {"encode": lambda bits: bits},
+            r"ValueError: gave no 960 bits of 0 and 1 at encode\(\); try: evlcp check",
+        ),
+        ({"encode": lambda bits: {}["boom"]}, r"KeyError: 'boom' \(test_block_coder.py, line "),
+    ],
+)
+def test_an_error_correction_that_fails_to_encode_is_named(broken: dict[str, Any], message: str) -> None:
+    code = SimpleNamespace(**({"message_bits": 400} | broken))
+    link = load_link().with_algorithm(
+        "error-correction", SimpleNamespace(compile=lambda bits: code), id="mine"
+    )
+    with pytest.raises(PluginError, match=f"^error-correction algorithm 'mine': {message}"):
+        compose(link, text="a")

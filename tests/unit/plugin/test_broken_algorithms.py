@@ -151,7 +151,14 @@ CASES: dict[tuple[str, str], tuple[Any, str]] = {
         make_algorithm(Uart, compile=steps(step_result, 5)),
         "gave int, expected Mapping",
     ),
-    ("framing", "book fails"): (make_algorithm(Uart, codebook=boom), "KeyError: 'boom'; "),
+    ("framing", "book fails"): (
+        make_algorithm(Uart, codebook=boom),
+        "KeyError: 'boom' (test_broken_algorithms.py, line ",
+    ),
+    ("framing", "no book"): (
+        make_algorithm(Uart, codebook=lambda *_: None),
+        "TypeError: gave NoneType at codeb",
+    ),
     ("framing", "book is five"): (
         make_algorithm(Uart, codebook=lambda *_: 5),
         "TypeError: gave int at codebook(),",
@@ -161,7 +168,7 @@ CASES: dict[tuple[str, str], tuple[Any, str]] = {
     ("pilots", "odd"): (OddPilots, "codebook preamble: expected a 1-D array of chips 0 and 1"),
     ("ranging", "unfinished"): (Unfinished, "TypeError: Can't instantiate abstract class Unfinished"),
     ("ranging", "no data"): (NoData, "TypeError: "),
-    ("ranging", "refuses"): (Refuses, "KeyError: 'boom'; "),
+    ("ranging", "refuses"): (Refuses, "KeyError: 'boom' (test_broken_algorithms.py, line "),
     ("ranging", "late"): (Late, "KeyError: 'boom' (test_broken_algorithms.py, line "),
     ("tracking", "nothing"): (
         make_algorithm(Tracking, compile=lambda self: None),

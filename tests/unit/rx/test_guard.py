@@ -223,7 +223,7 @@ def test_an_error_correction_that_gives_another_thing_is_named(gives, message):
 
     for compiled, expected in (
         (compile_code, message),
-        (lambda _: None, "TypeError: gave NoneType at compile"),
+        (lambda _: None, "TypeError: gave NoneType with message_bits"),
     ):
         with pytest.raises(PluginError, match=f"^error-correction algorithm 'mine': {expected}"):
             receive_stream(link_with("error-correction", compiled))
