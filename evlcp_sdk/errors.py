@@ -20,7 +20,7 @@ warns of a broken plugin that is left out.
 
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar
@@ -164,6 +164,13 @@ def blame(who: str, hint: str = "") -> Iterator[None]:
         raise
     except (Exception, SystemExit) as fault:
         raise PluginError(f"{who}: {describe_plugin_fault(fault)}{hint}") from fault
+
+
+def blame_class(one: object, what: str) -> AbstractContextManager[None]:
+    """`blame` by the class of an object; what one of the SDK's own raises passes."""
+    kind = type(one)
+    is_own = kind.__module__.startswith("evlcp_sdk.")
+    return nullcontext() if is_own else blame(f"{what} {kind.__name__}")
 
 
 def fault_message(fault: BaseException) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self
 
-from evlcp_sdk.errors import PluginError, StreamError, blame
+from evlcp_sdk.errors import PluginError, StreamError, blame_class
 from evlcp_sdk.values import Events, Triggers
 
 DEFAULT_MAX_EVENTS = 1 << 18
@@ -196,9 +196,7 @@ class EventSource(ABC):
         return events, triggers
 
     def _blame(self) -> AbstractContextManager[None]:
-        """`blame` for a plugin's source; what is raised in one of the SDK's own passes."""
-        is_own = type(self).__module__.startswith("evlcp_sdk.")
-        return nullcontext() if is_own else blame(f"{self.path}: source {type(self).__name__}")
+        return blame_class(self, f"{self.path}: source")
 
     def _plugin_error(self, what: str) -> PluginError:
         return PluginError(f"{self.path}: source {type(self).__name__}: {what}")

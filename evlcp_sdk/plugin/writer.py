@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import EvlcpError, OutputError, StreamError
+from evlcp_sdk.errors import EvlcpError, StreamError, blame_class
 from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.values import Events, Triggers, span_us
 
@@ -48,7 +48,7 @@ class EventWriter(ABC):
         with writing(self.path):
             self._file = self._outputs.open_binary(self.path)
         try:
-            with writing(self.path):
+            with blame_class(self, f"{self.path}: writer"), writing(self.path):
                 self._begin()
         except EvlcpError:
             self.discard()
@@ -72,7 +72,7 @@ class EventWriter(ABC):
         self._check_column("event", "p", events.p, 2)
         self._check_column("trigger", "channel", triggers.channel, self.channels)
         self._check_column("trigger", "value", triggers.value, 2)
-        with writing(self.path):
+        with blame_class(self, f"{self.path}: writer"), writing(self.path):
             self._write(events, triggers)
         if len(events) or len(triggers):
             self._last_us = span_us(events, triggers)[1]
@@ -96,12 +96,12 @@ class EventWriter(ABC):
         if self._file.closed:
             return
         try:
-            with writing(self.path):
+            with blame_class(self, f"{self.path}: writer"), writing(self.path):
                 self._finish()
                 self._file.close()
             if self._alone:
                 self._outputs.commit()
-        except OutputError:
+        except EvlcpError:
             self.discard()
             raise
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evlcp_sdk.errors import ConfigError, InputError, PluginWarning
-from evlcp_sdk.io import EventSource, open_source, open_writer, read_events, write_events
+from evlcp_sdk.errors import ConfigError, InputError, PluginError, PluginWarning
+from evlcp_sdk.io import EventSource, EventWriter, open_source, open_writer, read_events, write_events
 from evlcp_sdk.io.open import is_recording
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
@@ -136,3 +136,24 @@ def test_a_writer_that_cannot_be_used_is_named(tmp_path, suffix, reason):
         pytest.raises(ConfigError, match=f"suffix '.{suffix}', expected"),
     ):
         open_writer(tmp_path / f"a.{suffix}", 8, 8, registry=registry)
+
+
+class BrokenWriter(EventWriter):
+    """A writer of a stranger's package that fails at the file's end."""
+
+    def _write(self, events, triggers):
+        self._file.write(b"x")
+
+    def _finish(self):
+        raise KeyError("room")
+
+
+def test_a_writer_that_fails_is_named_and_leaves_no_file(tmp_path):
+    with (
+        pytest.raises(
+            PluginError, match=r"a\.dump: writer BrokenWriter: KeyError: 'room' \(test_open\.py, line"
+        ),
+        BrokenWriter(tmp_path / "a.dump", None, None) as writer,
+    ):
+        writer.write(EVENTS)
+    assert not list(tmp_path.iterdir())
