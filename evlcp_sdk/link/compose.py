@@ -48,8 +48,9 @@ def compose(
         repeat: Times in a row that each packet is sent.
 
     Raises:
-        ConfigError: Nothing to send, a kind that is not installed, a message that is too long or a number out
-            of range, packets of the link that are too short for messages, or the extra is not installed.
+        ConfigError: Nothing to send, a key or the user's bytes without a beacon, a kind that is not
+            installed, a message that is too long or a number out of range, packets of the link that are too
+            short for messages, or the extra is not installed.
         InputError: The key cannot be read.
 
     >>> compose(text="Tempo 30", transmitter_id=7).shape
@@ -85,6 +86,8 @@ def make_messages(
     sequence: int | None = None,
 ) -> list[Message]:
     """The messages that `compose` encodes; arguments and errors as there."""
+    if (key is not None and beacon is None) or (user and not isinstance(beacon, BarSite)):
+        raise ConfigError("key signs a beacon, and user goes into that of a site: give one, too")
     if transmitter_id is None:
         transmitter_id = beacon.transmitter_id if isinstance(beacon, BarSite) else 0
     number = int(time.time()) if sequence is None else sequence

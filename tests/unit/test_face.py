@@ -128,6 +128,8 @@ def test_what_is_refused() -> None:
     for arguments, message in (
         ({}, "nothing to send: give a text, data or a beacon"),
         ({"text": "x", "repeat": 0}, "repeat = 0, expected 1 or more"),
+        ({"text": "x", "key": "private.pem"}, "key signs a beacon, and user goes into that of a site"),
+        ({"beacon": evlcp.Beacon(48.0, 11.0, 500.0, 0.0, 0.0, 1.0), "user": b"x"}, "key signs a beacon, and"),
     ):
         with pytest.raises(evlcp.ConfigError, match=message):
             evlcp.compose(**arguments)
