@@ -18,6 +18,8 @@ from evlcp_sdk.values import NO_RANGE, DecodedFrame, Frame
 
 _COUNTS = "events_in_regions", "events_in_regions_on", "regions_opened", "regions_released", "frames"
 
+_TAKEN_COUNTS = (*_COUNTS, "events", "packets")
+
 _LOOKBACK_FRAMES = 96
 """Frames for which the places of a region are kept: a framing may give a frame so late."""
 
@@ -180,6 +182,8 @@ class PluginFramer(Framer):
             self._guard.expect(name, str)
             if not isinstance(count, int | np.integer):
                 self._guard.refuse(f"{type(count).__name__} for '{name}' at counts()", "whole numbers")
+            if name in _TAKEN_COUNTS:
+                self._guard.refuse(f"'{name}' at counts()", "another name, as the receiver counts these")
         before = deframed.counts or {}
         for name, count in now.items():
             self.counts[name] = self.counts.get(name, 0) + count - before.get(name, 0)

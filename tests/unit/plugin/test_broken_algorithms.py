@@ -151,6 +151,10 @@ CASES: dict[tuple[str, str], tuple[Any, str]] = {
         make_algorithm(Uart, compile=steps(step_result, 5)),
         "gave int, expected Mapping",
     ),
+    ("framing", "counts frames"): (
+        make_algorithm(Uart, compile=steps(step_result, {"frames": 5})),
+        "gave 'frames' at counts(), expected another name",
+    ),
     ("framing", "book fails"): (
         make_algorithm(Uart, codebook=boom),
         "KeyError: 'boom' (test_broken_algorithms.py, line ",
