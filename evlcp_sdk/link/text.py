@@ -10,20 +10,8 @@ from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.bar import SHAPES, BarLayout
 from evlcp_sdk.specs import make_model
 
-_UNITS = {
-    "deg_s": "deg/s",
-    "us": "us",
-    "ms": "ms",
-    "s": "s",
-    "hz": "Hz",
-    "ppm": "ppm",
-    "px": "px",
-    "um": "um",
-    "mm": "mm",
-    "m": "m",
-    "deg": "deg",
-    "chips": "chips",
-}
+_UNITS = ("deg_s", "us", "ms", "s", "hz", "ppm", "px", "um", "mm", "m", "deg", "chips")
+"""Ends of keys' names; those of rates come before those that they end with."""
 
 
 def to_toml(link: Link, registry: Registry) -> str:
@@ -60,7 +48,7 @@ def _make_lines(link: Link, registry: Registry) -> Iterator[str]:
 
 
 def _describe_key(key: str, schema: Mapping[str, Any]) -> str:
-    unit = next((unit for end, unit in _UNITS.items() if key.endswith(f"_{end}")), "")
+    unit = next((unit for unit in _UNITS if key.endswith(f"_{unit}")), "")
     bounds = [
         f"{sign} {schema[name]}"
         for name, sign in (
@@ -76,6 +64,7 @@ def _describe_key(key: str, schema: Mapping[str, Any]) -> str:
     if value is not None and schema.get("type") == "number":
         value = float(value)
     default = "none" if value is None else to_toml_value(value)
-    facts = ", ".join([*([unit] if unit else []), *bounds, *choices, f"default {default}"])
+    written = {"deg_s": "deg/s", "hz": "Hz"}.get(unit, unit)
+    facts = ", ".join([*([written] if unit else []), *bounds, *choices, f"default {default}"])
     text = str(schema.get("description", "")).strip()
     return f"{text} [{facts}]" if text else f"[{facts}]"

@@ -65,7 +65,7 @@ class Law:
             self.test(subject)
         except (LawError, InapplicableLawError):
             raise
-        except Exception as fault:
+        except (Exception, SystemExit) as fault:
             raise LawError(f"expected no exception, got {type(fault).__name__}: {fault}") from fault
 
 

@@ -1,6 +1,7 @@
 """The suite as users meet it: `check`, excuses, the decorator, `evlcp check`."""
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,7 +13,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import ROLES, Ranging
 from evlcp_sdk.testing import LawError, check, conformance, laws_of, suite
-from evlcp_sdk.testing.law import Verdict
+from evlcp_sdk.testing.law import Law, Subject, Verdict
 from evlcp_sdk.testing.links import LINK
 
 Evlcp = Callable[..., Any]
@@ -52,6 +53,8 @@ def test_the_decorator_makes_one_test_a_law():
         exact(Biased(), {"exact": "the lens is not calibrated yet"})()
     with pytest.raises(LawError, match=r"excused \(needless\), but it holds: drop the excuse"):
         exact(CentroidRanging(), {"exact": "needless"})()
+    with pytest.raises(LawError, match="expected no exception, got SystemExit: 3"):
+        Law("ends", "does not exit", lambda _: sys.exit(3)).apply(Subject("ranging", CentroidRanging()))
     nothing = load_link(overrides=["tracking.id=none"]).algorithm("tracking")
     cases = conformance("tracking", nothing, nothing).mark.args[1]
     (line,) = (case for case in cases if case.id.endswith("-1-straight-line"))
