@@ -27,7 +27,8 @@ class SpecError(ConfigError):
 
     def __init__(self, faults: Sequence[tuple[tuple[str, ...], str]]) -> None:
         self.faults = tuple(faults)
-        super().__init__("\n".join(f"{'.'.join(path)}{text}" for path, text in self.faults))
+        lines = (f"{'.'.join(path)}{text}".lstrip() for path, text in self.faults)
+        super().__init__("\n".join(lines))
 
 
 def build_spec(

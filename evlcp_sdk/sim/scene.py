@@ -687,6 +687,8 @@ def _set_value(table: dict[str, Any], key: str, value: Any) -> None:
     holders = [table]
     if rest and head in _LISTS:
         holders = rows = table.setdefault(head, [{}])
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            raise ConfigError(f"--set {key}: {head} = {rows!r}: expected tables [[{head}]]")
         if len(rest) > 1 and (head, rest[0]) != ("bars", "link"):
             number, *rest = rest
             if not number.isdigit() or int(number) >= len(rows):
@@ -698,15 +700,13 @@ def _set_value(table: dict[str, Any], key: str, value: Any) -> None:
     if len(parts) > (3 if parts[0] == "link" else 1 if parts is rest else 2):
         raise ConfigError(f"--set {key}: expected table.key, or link.TABLE.KEY, e.g. link.air.chip_rate_hz")
     for holder in holders:
-        _set_at(holder, parts, value.item() if isinstance(value, np.generic) else value)
-
-
-def _set_at(holder: dict[str, Any], parts: Sequence[str], value: Any) -> None:
-    """Set a value in a table, by the names of the tables in it on the way, which are copied."""
-    *tables, last = parts
-    for name in tables:
-        holder[name] = copy(holder[name]) if isinstance(holder.get(name), dict) else {}
-        holder = holder[name]
-    holder[last] = value
-    if tables[-1:] == ["bar"] and last == "leds_file":
-        holder.pop("leds", None)
+        *tables, last = parts
+        for name in tables:
+            inner = holder.get(name, {})
+            if not isinstance(inner, dict):
+                raise ConfigError(f"--set {key}: {name} = {inner!r}: expected a table")
+            holder[name] = copy(inner)
+            holder = holder[name]
+        holder[last] = value.item() if isinstance(value, np.generic) else value
+        if tables[-1:] == ["bar"] and last == "leds_file":
+            holder.pop("leds", None)

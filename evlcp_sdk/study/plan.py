@@ -183,7 +183,7 @@ class _Campaign:
     # Words of letters, digits, dots and dashes: files are named by it.
     name: Annotated[str, Field(pattern=r"^[\w.-]+( [\w.-]+)*$", max_length=200)]
     seeds: Annotated[int, Field(ge=1, le=1_000_000)] = 1
-    first_seed: Annotated[int, Field(ge=0)] = 0
+    first_seed: Annotated[int, Field(ge=0, lt=2**62)] = 0
     max_bits: Annotated[int | None, Field(ge=1)] = None
     max_errors: Annotated[int | None, Field(ge=1)] = None
     merge: tuple[str, ...] | None = None
@@ -309,6 +309,8 @@ def _make_cases(
                 settings[key] = _resolve_file(settings[key], folder.resolve())
             overrides = [f"{key}={to_toml_value(value)}" for key, value in settings.items()]
             try:
+                if not isinstance(case_base, str | None):
+                    raise ConfigError(f"variants.{name}.base = {case_base!r}: expected the name of a file")
                 case = make(_resolve_file(case_base, folder), overrides)
             except ConfigError as fault:
                 faults.extend(f"{path}: {kind}: {line}" for line in str(fault).splitlines())

@@ -68,11 +68,13 @@ def test_faults_are_reported_with_their_path(table: dict[str, Any], message: str
         ("mation.x=1", "--set mation.x: unknown table; did you mean 'motion'?"),
         ("seed.seed=5", "--set seed.seed: unknown table"),
         ("bars.7.ppm=1", "--set bars.7.ppm: expected one of 1 bar, from 0 on"),
+        ("bars=3 bars.ppm=1", "--set bars.ppm: bars = 3: expected tables [[bars]]"),
+        ("motion=3 motion.yaw_deg=1", "--set motion.yaw_deg: motion = 3: expected a table"),
     ],
 )
 def test_wrong_overrides_are_reported(override: str, message: str) -> None:
     with pytest.raises(ConfigError, match=f"^{re.escape(message)}"):
-        load_scene("night", [override])
+        load_scene("night", override.split())
 
 
 def test_a_bar_sends_what_the_air_interface_says() -> None:

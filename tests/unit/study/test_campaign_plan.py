@@ -90,6 +90,7 @@ def test_an_id_follows_everything_that_determines_the_result_and_nothing_else(tm
         ("[20, 30]", "20", "c.toml: scene.grid.speed_kmh = 20: expected a list of values"),
         ("[20, 30]", "[20, 20]", "c.toml: scene.grid.speed_kmh: a value stands there twice"),
         ("speed_kmh", "wrong", "c.toml: scene: wrong: unknown key"),
+        ("= {}", "= { base = 1 }", "c.toml: link: variants.16 clusters.base = 1: expected the name"),
         ("seeds = 3", 'seeds = 3\nmerge = ["scene.speed"]', "campaign.merge: 'scene.speed' is not varied"),
     ],
 )

@@ -217,6 +217,7 @@ SCENE = json.dumps(truth_of(Scene(duration_s=0.05)).table)
         (f"{GOOD}0,1,1 x,,0,0\n", "{}", None, 3, "frames.csv: line 2: symbols = 'x': expected a whole"),
         (f"{GOOD}0,1,1,-1e308,0,0\n", "{}", None, 3, "distance_m = '-1e308': expected at most"),
         (GOOD, "{}", None, 3, "not a scene's truth: scene: missing"),
+        (GOOD, "[]", None, 3, "not a scene's truth: = []: expected a table"),
         (GOOD, "{", None, 3, "not JSON"),
         (GOOD, None, None, 3, "cannot be read"),
         (GOOD, SCENE, "{", 3, "summary.json: not JSON"),
