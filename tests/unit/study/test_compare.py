@@ -131,7 +131,7 @@ def test_total_adds_recordings() -> None:
     assert mixed.rows["v0"].statistics.rows == 95
 
 
-def test_json_csv_and_html_parse_back() -> None:
+def test_json_csv_and_html_parse_back(tmp_path: Path) -> None:
     whole = comparison(table(make_measured(), make_measured(bit_errors=0)), table(BLIND, BLIND, bound=None))
     parsed = json.loads(whole.to_json())
     assert parsed == json.loads(json.dumps(whole.to_dict(), allow_nan=False))
@@ -160,6 +160,10 @@ def test_json_csv_and_html_parse_back() -> None:
     for one in whole.tables:
         for text, best in (cell for line in one.format_rows()[1] for cell in line):
             assert (Markup("<b>{}</b>").format(text) if best else escape(text)) in page
+    (tmp_path / "own.toml").write_text('modulation.id = "wh8"')
+    (several,) = load_variants(["v0:"], [ROOT / "examples/links/paper.toml", tmp_path / "own.toml"])
+    page = replace(comparison(table(make_measured())), variants={"v0": several.to_dict()}).to_html()
+    assert f"; SHA-256 {', '.join(link.digest for link in several.links.values())}" in page
 
 
 @pytest.mark.parametrize(
