@@ -179,9 +179,9 @@ def find_other_codewords(link: Link, registry: Registry) -> dict[str, NDArray[np
     """Codewords of the other installed modulations, by id, uint8 (symbols, chips)."""
     if "modulation" not in link.table:
         return {}
-    names = [one.algorithm.id for one in registry.list_algorithms("modulation")]
-    names.remove(link.table["modulation"]["id"])
-    links = {name: _change_link(link, {"modulation.id": name}, registry) for name in names}
+    names = {one.algorithm.id for one in registry.list_algorithms("modulation")}
+    names.discard(link.table["modulation"]["id"])
+    links = {name: _change_link(link, {"modulation.id": name}, registry) for name in sorted(names)}
     return {name: other.codebook.codewords for name, other in links.items() if other is not None}
 
 
