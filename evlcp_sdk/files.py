@@ -402,7 +402,7 @@ def check_columns(
     Raises:
         ConfigError: A needed one is missing, or one looks like another that is missing.
     """
-    known = (*needed, *optional)
+    known = tuple(dict.fromkeys((*needed, *optional)))
     missing_words = {name: _split_words(name) for name in known if name not in names}
     first_words = [_split_words(name)[:1] for name in known]
     for name in names:

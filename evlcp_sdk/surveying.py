@@ -159,6 +159,9 @@ def survey(
     placing = select_positioning_links(links)
     _check_layouts(placing)
     _check_recordings(recordings, poses, name)
+    for line, pose in enumerate(poses, 2):
+        if pose.attitude is None:
+            raise ConfigError(f"{name}: line {line}: a survey needs heading_deg, pitch_deg and roll_deg")
     known_ids = {site.transmitter_id for site in known}
     first, first_link = poses[0], next(iter(placing.values()))
     axes = LocalAxes(first.latitude_deg, first.longitude_deg, first.height_m)

@@ -160,7 +160,9 @@ class CameraOptions:
     heading_deg: Annotated[
         float | None, typer.Option(metavar="DEG", help="The camera's heading, clockwise from north.")
     ] = None
-    pitch_deg: Annotated[float | None, typer.Option(metavar="DEG", help="Its pitch, up.")] = None
+    pitch_deg: Annotated[
+        float | None, typer.Option(min=-90, max=90, metavar="DEG", help="Its pitch, up.")
+    ] = None
     roll_deg: Annotated[float | None, typer.Option(metavar="DEG", help="Its roll, top to the right.")] = None
     heading_sigma_deg: Annotated[
         float, typer.Option(min=0, hidden=True, help="Sigma of the heading, unless a file has it.")

@@ -80,7 +80,8 @@ def read_poses(path: Path | str) -> list[KnownPose]:
         ConfigError: A column is missing, or a value is not a number or is out of range.
     """
     names, rows = read_csv(path)
-    check_columns(path, names, ("t_us", *PLACE), _OPTIONAL)
+    angles = _ANGLES if any(name in names for name in _ANGLES) else ()
+    check_columns(path, names, ("t_us", *PLACE, *angles), _OPTIONAL)
     if not rows:
         raise ConfigError(f"{path}: expected one line of values or more")
     poses = []

@@ -158,10 +158,8 @@ def survey_bars(
     With the default `sigma` the camera is known exactly.
 
     Raises:
-        ConfigError: A view's attitude is unknown, no bar is seen, or the views do not fit one another.
+        ConfigError: No bar is seen, or the views do not fit one another.
     """
-    if any(view.rotation is None for view in views):
-        raise ConfigError("a survey needs poses with heading_deg, pitch_deg and roll_deg")
     ids = sorted({bar.transmitter for view in views for bar in view.bars})
     lengths_m = length_m if isinstance(length_m, Mapping) else dict.fromkeys(ids, length_m)
     lines = {id_: _estimate_start(views, id_, camera, lengths_m[id_]) for id_ in ids}

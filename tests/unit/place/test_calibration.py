@@ -167,6 +167,7 @@ def test_poses_are_read_and_their_faults_reported(tmp_path: Path) -> None:
         (head, "one line of values or more"),
         (head + "a.raw,,35,137,5,,,\n", r"line 2: t_us = '': expected a number"),
         (head + "a.raw,1,35,137,5,3,,\n", r"line 2: pitch_deg = '': expected a number"),
+        (head.replace("heading_deg,", ""), "line 1: no column heading_deg"),
         (head + "\na.raw,1,95,137,5,,,\n", r"line 3: latitude_deg = '95': expected -90 to 90"),
         (f"attitude_sigma_deg,{head}0,a.raw,1,35,137,5,1,1,1\n", r"line 2: attitude_sigma_deg = '0'"),
     ):
