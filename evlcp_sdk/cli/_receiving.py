@@ -161,7 +161,7 @@ class CameraOptions:
         float | None, typer.Option(metavar="DEG", help="The camera's heading, clockwise from north.")
     ] = None
     pitch_deg: Annotated[
-        float | None, typer.Option(min=-90, max=90, metavar="DEG", help="Its pitch, up.")
+        float | None, typer.Option(min=-89, max=89, metavar="DEG", help="Its pitch, up.")
     ] = None
     roll_deg: Annotated[float | None, typer.Option(metavar="DEG", help="Its roll, top to the right.")] = None
     heading_sigma_deg: Annotated[

@@ -167,7 +167,7 @@ def survey_bars(
         placed = [_place_bars(view, lines, lengths_m) for view in views]
         whitened = [one for view in placed if (one := WhitenedView.of(view, camera, spec)) is not None]
         if not whitened:
-            raise ConfigError("no view shows a bar: nothing to survey")
+            raise ConfigError("no view shows a bar that sends its id: nothing to survey")
         common = (max(v.place_sigma_m for v in whitened), max(v.turn_sigma_rad for v in whitened))
         solution = solve_views(whitened, camera, sigma.covariance_root(camera), common)
         change = 0.0

@@ -88,7 +88,7 @@ FORCES = "force_right_m_s2,force_down_m_s2,force_forward_m_s2"
 @pytest.mark.parametrize(
     ("columns", "values", "message"),
     [
-        ("", "95,0", "line 3: pitch_deg = '95': expected -90 to 90"),
+        ("", "90,0", "line 3: pitch_deg = '90': expected -89 to 89"),
         (",rate_right_deg_s", "0,0,0", "line 1: no column rate_down_deg_s"),
         (f",{RATES},force_down_m_s2", "0,0,0,0,0,0", "no column force_right_m_s2"),
         (f",{FORCES}", "0,0,0,0,0", "no column rate_right_deg_s: forces need"),
@@ -103,7 +103,7 @@ def test_lines_that_cannot_be_are_reported(
     tmp_path: Path, columns: str, values: str, message: str | None
 ) -> None:
     path = tmp_path / "imu.csv"
-    first = values.replace("95", "0").replace("1e17", "0")
+    first = values.replace("90", "0").replace("1e17", "0")
     path.write_text(f"{ANGLES}{columns}\n0,{first}\n1000,{values}\n")
     reported = refusal(lambda: AttitudeLog.read(path))
     assert reported is None if message is None else message in str(reported)
