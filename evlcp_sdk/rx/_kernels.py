@@ -805,7 +805,7 @@ def measure_pilot_light(
         edges = 0
         for i in range(length):
             edges += abs(codes[k, i])
-        top, bottom = find_rows(prior[k])
+        top, bottom = find_rows(prior[k] != 0)
         if edges == 0 or top >= bottom:
             out[k] = 0.0
             continue
@@ -839,12 +839,12 @@ def measure_pilot_light(
 
 @njit
 def find_rows(image: Array) -> tuple[int, int]:
-    """First row that is not all 0, and the one after the last; (0, 0) without any."""
+    """First row that is not all False, and the one after the last; (0, 0) without any."""
     top, bottom = 0, 0
     for r in range(len(image)):
         some, row = False, image[r]
         for c in range(row.size):
-            some |= row[c] != 0
+            some |= row[c]
         if some:
             top = r if bottom == 0 else top
             bottom = r + 1
@@ -1376,8 +1376,7 @@ def find_lit_clusters(
     empty, shown, heavy = np.ones((rows, columns), np.bool_), 0.0, 0.0
     for k in range(clusters):
         total = 0.0
-        top, bottom = find_rows(weight[k])
-        for r in range(top, bottom):
+        for r in range(rows):
             for c in range(columns):
                 if weight[k, r, c] != 0:
                     total += weight[k, r, c] * (shares[1, r, c] - least * shares[0, r, c])
