@@ -139,7 +139,7 @@ class Framer(ABC):
     ) -> None:
         self._packet, self._step_us = link.packet, link.regions.step_us
         self._clock, self._announcer = stream.clock, stream.announcer
-        self._name, self._queue, self._on_frame = name, queue, on_frame
+        self._name, self._numbers, self._queue, self._on_frame = name, stream.numbers, queue, on_frame
         self.counts = dict.fromkeys(counts, 0)
         self.light_spans_us: dict[int, tuple[float, float]] = {}
         self.ranging_every = 1

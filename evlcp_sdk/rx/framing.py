@@ -171,7 +171,7 @@ class PacketFramer(Framer):
         self._pending: deque[PendingFrame] = deque()
         self._regions, self._follower = regions, follower
         self._transmitters = Transmitters(
-            link.packet, self._step_us, stream.limits, stream.numbers, link.codebook.trailing_chips
+            link.packet, self._step_us, stream.limits, link.codebook.trailing_chips
         )
         self._preamble = 2 * link.codebook.preamble.astype(np.float64) - 1
         self._reflections = queue.reflections
@@ -438,7 +438,7 @@ class PacketFramer(Framer):
             return Skipped.UNREAD
         if not known:
             self._claim_ended_parts(transmitter.region, due.start_us)
-        self._transmitters.assign_number(transmitter)
+            transmitter.number = next(self._numbers)
         frame = self._publish_frame(transmitter, due, found)
         return self._build_detection(transmitter, due, found, frame)
 

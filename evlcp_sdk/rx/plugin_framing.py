@@ -67,7 +67,6 @@ class PluginFramer(Framer):
         )
         self._codebook = link.codebook
         self._deframed: dict[int, _DeframedRegion] = {}
-        self._numbers = stream.numbers
         frames_us = _LOOKBACK_FRAMES * link.packet.info_chips * link.packet.chip_us
         self.patience_us = max(2 * link.packet.packet_chips * link.packet.chip_us, frames_us)
 

@@ -9,7 +9,7 @@ in the middle of every value, so that its rows wait for one another: 20 us at 50
 import cmath
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -276,9 +276,7 @@ class Transmitter:
 class Transmitters:
     """The regions with what is known of them; those in sight are `alive`, by the number of their region."""
 
-    def __init__(
-        self, packet: PacketFormat, step_us: int, limits: Limits, numbers: Iterator[int], trailing_chips: int
-    ) -> None:
+    def __init__(self, packet: PacketFormat, step_us: int, limits: Limits, trailing_chips: int) -> None:
         self._packet = packet
         self._lookback_us = LOOKBACK_PACKETS * packet.packet_chips * packet.chip_us
         self._trailing_chips = trailing_chips
@@ -286,7 +284,6 @@ class Transmitters:
         self._step_us = step_us
         self.alive: dict[int, Transmitter] = {}
         self._released: list[Transmitter] = []
-        self._numbers = numbers
 
     def add(self, region: TrackedRegion, sync: Any, state: BarState) -> Transmitter:
         """Add a new region, with the first states of its synchronization and its frames."""
@@ -317,11 +314,6 @@ class Transmitters:
         new = self.add(region, old.sync, old.fetch_state()._replace(frame=-1, pilot=None))
         new.row_delay = old.row_delay
         return new
-
-    def assign_number(self, transmitter: Transmitter) -> None:
-        """Give a transmitter the next number, unless it has one."""
-        if transmitter.number is None:
-            transmitter.number = next(self._numbers)
 
     def _resume_lost(self, transmitter: Transmitter, lock: SyncLock) -> bool:
         """Resume a transmitter that was lost from sight, if the packets are on its grid."""
