@@ -206,13 +206,10 @@ class CameraOptions:
             raise typer.BadParameter(
                 "gravity needs --pitch-deg and --roll-deg; a heading needs gravity", param_hint="--pitch-deg"
             )
-        names = (
-            *("--heading-deg", "--pitch-deg", "--roll-deg"),
-            *("--gravity-sigma-deg", "--heading-sigma-deg", "--white-sigma-deg", "--time-sigma-us"),
-        )
-        for name, value in zip(names, (*angles, *sigmas), strict=True):
-            if value is not None and not math.isfinite(value):
-                raise typer.BadParameter(f"{value}: expected a finite number", param_hint=name)
+        for name, value in vars(self).items():
+            if isinstance(value, float) and not math.isfinite(value):
+                option = f"--{name.replace('_', '-')}"
+                raise typer.BadParameter(f"{value}: expected a finite number", param_hint=option)
         if place.attitude_file is not None:
             return sdk.attitude.AttitudeLog.read(
                 place.attitude_file, sdk.attitude.Attitude(0.0, 0.0, None, *sigmas)
