@@ -184,8 +184,8 @@ class PacketFramer(Framer):
         per_step = self._step_us / (link.packet.info_chips * link.packet.chip_us)
         self._max_due = math.ceil(per_step) + _MAX_OVERDUE
         caught_up = math.ceil(LOOKBACK_PACKETS * link.packet.frames / (self._max_due - per_step))
-        packets_us = LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us
-        self.patience_us = packets_us + (caught_up + _APPLY_AFTER_STEPS) * self._step_us
+        steps_us = (caught_up + _APPLY_AFTER_STEPS) * self._step_us
+        self.patience_us = LOOKBACK_PACKETS * link.packet.packet_us + steps_us
         self._pilot_frames = 0
         self._now_us = 0
 

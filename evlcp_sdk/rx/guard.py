@@ -136,7 +136,7 @@ class Guard:
         self.expect(locks, list)
         if len(locks) > _MAX_LOCKS:
             self.refuse(f"{len(locks)} locks in a step", f"at most {_MAX_LOCKS}")
-        chip_us, whole_us = packet.chip_us, packet.packet_chips * packet.chip_us
+        chip_us, whole_us = packet.chip_us, packet.packet_us
         max_us = _MAX_LOCK_PACKETS * whole_us
         ranges = {
             "chip_us": (chip_us / 2, chip_us * 2),

@@ -82,7 +82,7 @@ class LinkArbiter:
         self._links = tuple(links)
         self._gap_px = max(link.regions.merge_px for link in links)
         self._wait_us = patience_us + self._links[0].regions.step_us
-        self._longest_us = max(link.packet.packet_chips * link.packet.chip_us for link in links)
+        self._longest_us = max(link.packet.packet_us for link in links)
         self._waiting: deque[PacketCandidate] = deque()
         self._decided: deque[PacketCandidate] = deque()
         self._frames = 0

@@ -68,7 +68,7 @@ class PluginFramer(Framer):
         self._codebook = link.codebook
         self._deframed: dict[int, _DeframedRegion] = {}
         frames_us = _LOOKBACK_FRAMES * link.packet.info_chips * link.packet.chip_us
-        self.patience_us = max(2 * link.packet.packet_chips * link.packet.chip_us, frames_us)
+        self.patience_us = max(2 * link.packet.packet_us, frames_us)
 
     def step(self, regions: list[TrackedRegion], step: TimeStep) -> None:
         """Decode what the regions of a time step send."""

@@ -270,7 +270,7 @@ class LinkReceiver:
                 link.camera,
                 link.packet.chip_us,
                 centre_filter,
-                LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
+                LOOKBACK_PACKETS * link.packet.packet_us,
                 stream.limits,
                 link.codebook.longest_gap_chips,
                 detector,

@@ -229,7 +229,7 @@ class Reflections:
     def __init__(self, packet: PacketFormat, codewords: int) -> None:
         self._codewords = codewords
         self._chip_us = packet.chip_us
-        self._keep_us = _LOOKBACK_PACKETS * packet.packet_chips * packet.chip_us
+        self._keep_us = _LOOKBACK_PACKETS * packet.packet_us
         self._seen: dict[int, deque[FrameDetection]] = {}
         self._pairs: dict[tuple[int, int], _Pair] = {}
         self._echo_of: dict[int, int] = {}

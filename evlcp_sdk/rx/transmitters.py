@@ -278,7 +278,7 @@ class Transmitters:
 
     def __init__(self, packet: PacketFormat, step_us: int, limits: Limits, trailing_chips: int) -> None:
         self._packet = packet
-        self._lookback_us = LOOKBACK_PACKETS * packet.packet_chips * packet.chip_us
+        self._lookback_us = LOOKBACK_PACKETS * packet.packet_us
         self._trailing_chips = trailing_chips
         self._max_remembered = limits.remembered
         self._step_us = step_us

@@ -3,10 +3,9 @@
 An edge of the light triggers a burst of events of one polarity, late and with a tail; a light that moves or
 shimmers triggers events of both as long as it is on. The receiver learns from the stream itself, without
 training: the number of events of either polarity in each sixteenth of a bit, by the bit and the three before
-    it;
-the spread of the strength of bits; the error of the clock, and the frequency of pauses. That gives each tick
-of the stream a log-likelihood of each context of a bit; the score of a character is that of its bits, and the
-best sequence of characters and pauses is found as a whole.
+it; the spread of the strength of bits; the error of the clock, and the frequency of pauses. That gives each
+tick of the stream a log-likelihood of each context of a bit; the score of a character is that of its bits,
+and the best sequence of characters and pauses is found as a whole.
 """
 
 from dataclasses import dataclass, field, replace

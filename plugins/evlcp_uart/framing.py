@@ -104,12 +104,10 @@ def read_characters(
     """
     decoder = (Uart() if uart is None else uart).make_decoder(bit_rate_hz)
     state, found = CharacterState(), list[Character]()
+    t_us, p = np.asarray(t_us, np.int64), np.asarray(p, np.uint8)
     for k in range(0, len(t_us), _PIECE_EVENTS):
-        t, q = (
-            np.asarray(t_us[k : k + _PIECE_EVENTS], np.int64),
-            np.asarray(p[k : k + _PIECE_EVENTS], np.uint8),
-        )
-        state, more = decoder.step(state, t, q, int(t[-1]))
+        piece = slice(k, k + _PIECE_EVENTS)
+        state, more = decoder.step(state, t_us[piece], p[piece], int(t_us[piece][-1]))
         found += more
     return found + decoder.close(state)[1]
 
