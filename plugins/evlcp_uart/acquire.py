@@ -25,8 +25,7 @@ to distinguish it from another code."""
 _FRAMED = 0.6
 """Least evidence of the start, parity and stop bits of clear characters, as a share of that of equally clear
 data bits: it is 1 but for misread bits, and 0.8 if one bit in seven is wrong. With another code, in which
-    characters
-are searched where they fit, its mean is a tenth."""
+characters are searched where they fit, its mean is a tenth."""
 
 _NEXT_FRAMED = 0.9
 """The same for a light that explains less than the best, as one of several tries."""
