@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from html import escape
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pandas
     import pyarrow
 
-_COLUMNS = (
+_COLUMNS: Final[tuple[tuple[str, np.dtype[Any]], ...]] = (
     ("t_us", np.dtype(np.int64)),
     ("x", np.dtype(np.uint16)),
     ("y", np.dtype(np.uint16)),
@@ -64,13 +64,19 @@ class Events:
 
     @classmethod
     def of(cls, t_us: Any, x: Any, y: Any, p: Any) -> Self:
-        """Events from array-likes, converted to the column types."""
-        return cls(
-            np.ascontiguousarray(t_us, np.int64),
-            np.ascontiguousarray(x, np.uint16),
-            np.ascontiguousarray(y, np.uint16),
-            np.ascontiguousarray(p, np.uint8),
-        )
+        """Events from array-likes, converted to the column types.
+
+        Raises:
+            StreamError: A value that its column cannot hold, such as a time in seconds, or -1 for a column.
+        """
+        columns = []
+        for (name, dtype), given in zip(_COLUMNS, (t_us, x, y, p), strict=True):
+            values = np.asarray(given)
+            with np.errstate(invalid="ignore"):
+                columns.append(np.ascontiguousarray(values.astype(dtype, copy=False)))
+            if values.dtype != dtype and (changed := values != columns[-1]).any():
+                raise StreamError(f"events column {name}: {values[changed][0]}, expected {dtype}")
+        return cls(*columns)
 
     @classmethod
     def from_columns(

@@ -11,6 +11,7 @@ import pytest
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.kinds import TextKind
+from evlcp_sdk.errors import StreamError
 from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS
 from evlcp_sdk.values import (
     Events,
@@ -79,6 +80,21 @@ def test_a_reflection_and_a_symbol_that_is_not_given_are_seen_in_reprs() -> None
     assert (one.echo_of, packet().echo_of, replace(one, frames=()).echo_of) == (2, None, None)
     assert "transmitter 0, a reflection of 2, packet 1" in repr(one)
     assert "23 - 8 51" in one._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ("columns", "fault"),
+    [
+        (([0.5, 1], [1, 2], [1, 2], [0, 1]), "t_us: 0.5, expected int64"),
+        (([1, np.nan], [1, 2], [1, 2], [0, 1]), "t_us: nan, expected int64"),
+        (([1, 2], [1, 65536], [1, 2], [0, 1]), "x: 65536, expected uint16"),
+        (([1, 2], [1, 2], np.array([1, -1]), [0, 1]), "y: -1, expected uint16"),
+    ],
+)
+def test_events_of_what_columns_cannot_hold_are_refused(columns, fault) -> None:
+    with pytest.raises(StreamError, match=fault):
+        Events.of(*columns)
+    assert Events.of([1.0, 2.0], [1, 2], [3, 4], [True, False]).p.tolist() == [1, 0]
 
 
 def test_a_packet_in_a_notebook() -> None:
