@@ -181,8 +181,13 @@ class Link:
         return _assemble_link(parts, table, revisions, self.kinds, self.built_in - {role}, self.name)
 
     def with_air(self, **changes: Any) -> "Link":
-        """The same link with other values in `[air]`, e.g. `link.with_air(pilot_every=4)`."""
-        air = replace(self.air, **changes)
+        """The same link with other values in `[air]`, e.g. `link.with_air(pilot_every=4)`.
+
+        Raises:
+            ConfigError: A value is wrong.
+        """
+        with name_place("air."):
+            air = build_spec(AirSpec, asdict(self.air) | changes)
         parts, table = self._objects_by_section() | {"air": air}, {**self.table, "air": asdict(air)}
         return _assemble_link(parts, table, self.revisions, self.kinds, self.built_in, self.name)
 

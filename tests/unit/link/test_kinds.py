@@ -54,6 +54,8 @@ def test_the_kinds_go_with_the_link() -> None:
     assert LINK.kinds.keys() == {1, 2, 3, 4, 5, 6, 15}
     assert pickle.loads(pickle.dumps(LINK)).kinds[15].name == "wind"
     assert LINK.with_air(pilot_every=2).kinds is LINK.kinds
+    with pytest.raises(ConfigError, match=r"^air\.pilot_every = 0: expected greater than 0$"):
+        LINK.with_air(pilot_every=0)
     assert LINK.digest == load_link().digest
     for number, kind in BUILT_IN_KINDS.items():
         assert (kind.number, kind.name) == (number, Kind(number).name.lower())
