@@ -146,8 +146,8 @@ class Codebook:
         codewords: One code a symbol, uint8 (S, M).
 
     Raises:
-        ConfigError: A code has chips other than 0 and 1, or two rows have the same edges, so that no camera
-            could distinguish them.
+        ConfigError: A code has chips other than 0 and 1, there is one codeword only, or two rows have the
+            same edges, so that no camera could distinguish them.
 
     Two codebooks are equal when their digests are.
 
@@ -177,6 +177,8 @@ class Codebook:
                     f"codebook {name}: expected a {ndim}-D array of chips 0 and 1{hint};"
                     f" got {given.dtype} of shape {given.shape}"
                 )
+            if name == "codewords" and len(given) < 2:
+                raise ConfigError("codebook codewords: 1 row, expected two or more")
             code = given.astype(np.uint8)
             code.setflags(write=False)
             object.__setattr__(self, name, code)

@@ -434,7 +434,6 @@ def _assemble_link(
                 raise TypeError(f"gave {type(codebook).__name__} at codebook(), expected a Codebook")
             if codebook.clusters != bar.clusters:
                 raise ValueError(f"gave codes of {codebook.clusters} clusters, expected {bar.clusters}")
-            _check_alphabet(codebook)
     if codebook is None:
         codebook = _codes_of_roles(parts, table)
     content = {"table": table, "codebook": codebook.digest, "revisions": dict(revisions)}
@@ -462,19 +461,11 @@ def _codes_of_roles(parts: Mapping[str, Any], table: Mapping[str, Mapping[str, A
     with _name_faults("modulation", table):
         codewords = modulation.codewords()
     try:
-        codebook = Codebook(table["modulation"]["id"], preamble, codes, codewords)
+        return Codebook(table["modulation"]["id"], preamble, codes, codewords)
     except ConfigError as fault:
         role = "modulation" if str(fault).startswith("codebook codewords") else "pilots"
         id = table[role]["id"]
         raise ConfigError(add_check_hint(f"{role} algorithm '{id}': {fault}", role, id)) from fault
-    with _name_faults("modulation", table):
-        _check_alphabet(codebook)
-    return codebook
-
-
-def _check_alphabet(codebook: Codebook) -> None:
-    if len(codebook.codewords) < 2:
-        raise ValueError("gave 1 codeword, expected two or more")
 
 
 def _describe_unused_role(framing: str) -> str:

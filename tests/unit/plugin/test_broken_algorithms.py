@@ -168,7 +168,7 @@ CASES: dict[tuple[str, str], tuple[Any, str]] = {
         "TypeError: gave int at codebook(),",
     ),
     ("modulation", "words are alike"): (words(np.repeat(LONE, 2, 0)), "codebook codewords: rows 0 and 1"),
-    ("modulation", "one word"): (words(LONE), "ValueError: gave 1 codeword, expected two or more; "),
+    ("modulation", "one word"): (words(LONE), "codebook codewords: 1 row, expected two or more; "),
     ("pilots", "odd"): (OddPilots, "codebook preamble: expected a 1-D array of chips 0 and 1"),
     ("ranging", "unfinished"): (Unfinished, "TypeError: Can't instantiate abstract class Unfinished"),
     ("ranging", "no data"): (NoData, "TypeError: "),
