@@ -349,9 +349,8 @@ def _algorithm_fault(record: Algorithm, _others: object) -> str | None:
         return fault
     if record.role not in ROLES:
         return f"{who} has role '{record.role}', expected one of {', '.join(ROLES)}"
-    if not isinstance(record.revision, int):
-        return f"{who}: revision = {record.revision!r}, expected a whole number"
-    return None
+    revision: object = record.revision
+    return None if isinstance(revision, int) else f"{who}: revision = {revision!r}, expected a whole number"
 
 
 def _algorithms_of(plugin: Any) -> frozenset[tuple[str, str]]:
