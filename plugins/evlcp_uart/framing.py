@@ -30,7 +30,6 @@ class Uart(Framing):
     The rate of the bits is `air.chip_rate_hz`, the characters of a packet are `air.frames_per_packet`.
     """
 
-    roles: ClassVar[frozenset[str]] = frozenset()
     detection: ClassVar[str] = "spots"
     characters_on_air: ClassVar[bool] = True
     clock_share: ClassVar[float] = CLOCK_SHARE
