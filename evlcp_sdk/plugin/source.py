@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self
@@ -183,7 +183,7 @@ class EventSource(ABC):
             yield events, triggers
 
     def _take_checked(self, max_events: int) -> tuple[Events, Triggers] | None:
-        with self._blame():
+        with blame_class(self, f"{self.path}: source"):
             piece: object = self.take(max_events)
         if piece is None:
             return None
@@ -194,9 +194,6 @@ class EventSource(ABC):
         if not self._gives_bits and len(events) and events.p.max() > 1:
             raise self._plugin_error(f"gave polarity {events.p.max()}, expected 0 or 1")
         return events, triggers
-
-    def _blame(self) -> AbstractContextManager[None]:
-        return blame_class(self, f"{self.path}: source")
 
     def _plugin_error(self, what: str) -> PluginError:
         return PluginError(f"{self.path}: source {type(self).__name__}: {what}")
@@ -217,5 +214,8 @@ class EventSource(ABC):
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         # An earlier error matters more than a failure to close after it.
-        with nullcontext() if error is None else suppress(PluginError), self._blame():
+        with (
+            nullcontext() if error is None else suppress(PluginError),
+            blame_class(self, f"{self.path}: source"),
+        ):
             self.close()
