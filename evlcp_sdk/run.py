@@ -204,9 +204,10 @@ class Reception(Iterator[Packet]):
         return self.source.losses
 
     def close(self) -> None:
-        """Close the source, also before its end; incomplete packets are dropped."""
+        """Close the source and end the workers, also before its end; incomplete packets are dropped."""
         self._packets = iter(())
         self.source.close()
+        self.receiver.end_workers()
 
     def __repr__(self) -> str:
         counts = self.counts

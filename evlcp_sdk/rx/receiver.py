@@ -194,9 +194,13 @@ class Receiver:
             packets += self._arbitrate(self._arbiter, math.inf)
         for one in self._receivers:
             one.close()
+        self.end_workers()
+        return packets
+
+    def end_workers(self) -> None:
+        """End the worker processes, of a stream that is not read to its end."""
         if self._workers is not None:
             self._workers.close()
-        return packets
 
     def _is_waiting(self) -> bool:
         """Whether anything waits for the next time step."""

@@ -9,9 +9,11 @@ import pytest
 from rx_streams import LINK, frame_content, frames_of, lit, noise_events, receive_cut
 
 from evlcp_sdk.errors import ConfigError, PluginError, WorkerError
+from evlcp_sdk.files import find_shipped_file
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.run import receive
 from evlcp_sdk.rx import workers
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.recordings import merge_events
@@ -74,6 +76,13 @@ def test_what_fails_in_a_worker_is_named():
     for many in (1, 2):
         with pytest.raises(PluginError, match=r"^ranging algorithm .broken.: ZeroDivisionError: boom"):
             receive_cut(broken, EVENTS, workers=many)
+
+
+def test_who_stops_reading_ends_the_workers():
+    before = multiprocessing.active_children()
+    with receive(find_shipped_file("recordings", "night-50m-30kmh-cut.raw"), workers=2) as packets:
+        next(packets)
+    assert set(multiprocessing.active_children()) <= set(before)
 
 
 def test_what_cannot_be():
