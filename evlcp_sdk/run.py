@@ -22,7 +22,7 @@ from evlcp_sdk.errors import (
 )
 from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
-from evlcp_sdk.io.describe import check_sensor, summarize_source
+from evlcp_sdk.io.describe import Span, check_sensor, summarize_source
 from evlcp_sdk.io.interruptible import open_until_stopped, stream_until_stopped
 from evlcp_sdk.io.open import STDIN, is_recording
 from evlcp_sdk.link.resolve import Link
@@ -430,8 +430,7 @@ def _run_to_end(
     broken: PluginError | WorkerError | None = None
     packet_count = 0
     pieces = iter(pieces)
-    first_us = last_us = None
-    watch = Stopwatch()
+    span, watch = Span(), Stopwatch()
     with watch.measure():
         try:
             while True:
@@ -447,8 +446,7 @@ def _run_to_end(
                     status, error, broken = "failed", str(fault), fault
                     break
                 if len(events):
-                    first_us = int(events.t_us[0]) if first_us is None else first_us
-                    last_us = int(events.t_us[-1])
+                    span.add(events)
                     writer.events(events)
                 writer.write(packets)
                 packet_count += len(packets)
@@ -466,7 +464,7 @@ def _run_to_end(
         status, error = "degraded", f"{url}: {reason}"
     end = RunEnd(
         status,
-        **_build_tables(source, url, watch, first_us, last_us),
+        **_build_tables(source, url, watch, span),
         counts=receiver.counts,
         losses=source.losses,
         error=error,
@@ -480,10 +478,8 @@ def _run_to_end(
     return summary
 
 
-def _build_tables(
-    source: EventSource, url: str, watch: Stopwatch, first_us: int | None, last_us: int | None
-) -> dict[str, dict[str, Any]]:
-    recording = summarize_source(source, url, first_us, last_us)
+def _build_tables(source: EventSource, url: str, watch: Stopwatch, span: Span) -> dict[str, dict[str, Any]]:
+    recording = summarize_source(source, url, span)
     recording |= {"guessed": source.guessed, "step_us": source.step_us}
     duration_s = recording["duration_s"]
     processing = {

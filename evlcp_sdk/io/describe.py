@@ -1,6 +1,6 @@
 """Summarize a recording without decoding its light, and check that it is of the link's sensor."""
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -8,24 +8,43 @@ import numpy as np
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import Events
 
 RATE_WINDOW_US = 10_000
 """The peak rate is the most events in a window of this length on a fixed grid."""
 
 
-def summarize_source(
-    source: EventSource, name: str, first_us: int | None, last_us: int | None
-) -> dict[str, Any]:
+@dataclass
+class Span:
+    """The time of a stream: first and last event, and the duration, which grows where the clock restarts."""
+
+    first_us: int | None = None
+    last_us: int | None = None
+    duration_us: int = 0
+
+    def add(self, events: Events) -> None:
+        """Add the next events, one or more."""
+        start_us, end_us = int(events.t_us[0]), int(events.t_us[-1])
+        if self.first_us is None or self.last_us is None:
+            self.first_us = self.last_us = start_us
+        self.duration_us += max(start_us - self.last_us, 0)
+        # They end before their start only where the clock restarts in them.
+        is_rising = end_us >= start_us
+        self.duration_us += end_us - start_us if is_rising else int(np.diff(events.t_us).clip(0).sum())
+        self.last_us = end_us
+
+
+def summarize_source(source: EventSource, name: str, span: Span) -> dict[str, Any]:
     """Return the file, sensor, time and event rate of a source that was read, as JSON values."""
-    duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
+    duration_s = span.duration_us * 1e-6
     return {
         "path": name,
         "format": source.format,
         "bytes": source.size_bytes,
         "width": source.width,
         "height": source.height,
-        "first_us": first_us,
-        "last_us": last_us,
+        "first_us": span.first_us,
+        "last_us": span.last_us,
         "duration_s": round(duration_s, 6),
         "events_per_s": round(source.counts["events"] / duration_s) if duration_s else None,
         "counts": dict(source.counts),
@@ -40,8 +59,7 @@ def describe_source(source: EventSource, name: str) -> dict[str, Any]:
     Raises:
         InputError: It cannot be read on.
     """
-    first_us = last_us = None
-    positive = 0
+    span, positive = Span(), 0
     window, in_window, peak = -1, 0, 0
     edges = np.zeros((256, 2), np.int64)
     for events, triggers in source.stream():
@@ -49,15 +67,14 @@ def describe_source(source: EventSource, name: str) -> dict[str, Any]:
         edges += np.bincount(kinds, minlength=edges.size).reshape(edges.shape)
         if not len(events):
             continue
-        first_us = int(events.t_us[0]) if first_us is None else first_us
-        last_us = int(events.t_us[-1])
+        span.add(events)
         positive += int(events.p.sum(dtype=np.int64))
         windows, counts = np.unique(events.t_us // RATE_WINDOW_US, return_counts=True)
         for w, n in zip(windows.tolist(), counts.tolist(), strict=True):
             in_window = in_window + n if w == window else n
             window, peak = w, max(peak, in_window)
     total = source.counts["events"]
-    return summarize_source(source, name, first_us, last_us) | {
+    return summarize_source(source, name, span) | {
         "header": dict(source.header),
         "peak_events_per_s": round(peak * 1e6 / RATE_WINDOW_US),
         "positive_share": round(positive / total, 4) if total else None,

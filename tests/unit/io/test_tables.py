@@ -13,6 +13,7 @@ from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk.errors import InputError, StreamError
 from evlcp_sdk.io import open_source, open_writer, read_events, write_events
+from evlcp_sdk.io.describe import Span
 from evlcp_sdk.values import Events, Triggers
 
 times, sides = st.integers(-(10**18) + 1, 10**18 - 1), st.integers(0, 65535)
@@ -240,3 +241,7 @@ def test_a_clock_may_leap_and_a_time_be_wrong(name, size, tmp_path):
     first = 201 if name == "a.npz" else 202
     assert {k: (v.count, v.first) for k, v in source.losses.items()} == {"time_doubtful": (1, first)}
     assert source.counts["clock_restarts"] == 2
+    span = Span()
+    for part in (stretch(5_000_000), stretch(0), Events.concat([stretch(5_000_000), stretch(0)])):
+        span.add(part)
+    assert span.duration_us == 5_000_000 + 3 * np.ptp(stretch(0).t_us)
