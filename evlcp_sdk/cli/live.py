@@ -171,6 +171,12 @@ def _serve(
         for server in servers.values():
             if missed := server.dropped:
                 print_stderr(f"{server.url}: {missed} results were not sent, as clients were too slow")
+        if recorder is not None:
+            state = recorder.state
+            if state["fault"]:
+                print_stderr(f"the recording ended: {state['fault']}")
+            if state["dropped"]:
+                print_stderr(f"{state['file']}: {state['dropped']} pieces are missing: the disk was too slow")
 
 
 def _exit_code(summary: dict[str, Any], interrupted: Path | None) -> int:
