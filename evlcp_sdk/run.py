@@ -545,6 +545,8 @@ def film(
     links = name_links(load_links(link, registry=registry))
     camera = next(iter(links.values())).camera
     with open_source(recording, registry) as source:
+        if source.size_bytes is None:
+            raise ConfigError(f"{recording}: a film needs a file: it reads the recording twice")
         check_sensor(source, recording, camera)
         footage = gather_footage(source, str(recording), links, registry, from_ms, for_ms * 1e3, advance)
     plan = plan_film(footage, for_ms * 1e3, slow, camera, longest_px, whole=whole)

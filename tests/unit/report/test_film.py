@@ -152,6 +152,7 @@ def test_what_cannot_be_filmed(demo_raw: Path, tmp_path: Path) -> None:
         ("20 ms at 1/inf would be inf pictures", demo_raw, out, {"slow": math.inf}),
         ("500 pictures of 1280 x 740 px are 474 megapixels, at most 160", demo_raw, out, large),
         ("a film needs a file", "-", out, {}),
+        ("loop=1: a film needs a file", f"replay:{few}?loop=1", out, {}),
         ("a.avi: a film is written as NAME.webp or NAME.gif or NAME.mp4", few, tmp_path / "a.avi", {}),
         (r"ends 3\.0 ms after its first event, nothing to show from 4 ms on", few, out, {"from_ms": 4}),
         ("no.raw: no events", no, out, {}),
