@@ -58,9 +58,6 @@ def _open_as(url: str, format: str) -> "EventSource | None":
 def _detect_format(name: str) -> str:
     """Return the format of a file by its suffix or its first bytes, or of a folder; empty for another."""
     path = Path(name)
-    by_suffix = _SUFFIXES.get(path.suffix.lower(), "")
-    if by_suffix == "faery":
-        return by_suffix
     try:
         if path.is_dir():
             return "bag" if (path / "metadata.yaml").is_file() else ""
@@ -70,8 +67,8 @@ def _detect_format(name: str) -> str:
             start = file.read(16)
     except OSError:
         return ""
-    by_start = next((found for magic, found in _STARTS.items() if start.startswith(magic)), "")
-    return by_start or by_suffix
+    by_suffix = _SUFFIXES.get(path.suffix.lower(), "")
+    return next((found for magic, found in _STARTS.items() if start.startswith(magic)), by_suffix)
 
 
 @hookimpl(trylast=True)

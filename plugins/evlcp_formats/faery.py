@@ -34,8 +34,6 @@ class FaerySource(EventSource):
     def __init__(self, path: Path | str) -> None:
         target = Path(path)
         name, kind = _FORMATS[target.suffix.lower()]
-        if not target.is_file():
-            raise InputError(f"{path}: {'not a file' if target.exists() else 'No such file or directory'}")
         faery = import_extra("faery", "faery", str(path), InputError)
         try:
             stream = faery.events_stream_from_file(target, dimensions_fallback=UNKNOWN_SIZE, file_type=kind)
