@@ -113,7 +113,6 @@ class LiveLoop:
         Raises:
             InputError: The source cannot be read on.
         """
-        self._start_s = self._status_s = self._taken_s = time.monotonic()
         try:
             while not stopped():
                 piece = self._reader.take(_IDLE_S)
