@@ -6,8 +6,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from evlcp_sdk.errors import OutputError
-from evlcp_sdk.io.evt import EVT3
+from evlcp_sdk.errors import OutputError, StreamError
+from evlcp_sdk.io.evt import EVT3, MAX_SIDE
 from evlcp_sdk.io.interruptible import stream_until_stopped
 from evlcp_sdk.io.raw import RawEncoder, format_header
 from evlcp_sdk.live.publisher import Publisher, Subscription
@@ -82,9 +82,13 @@ class Sender:
 
         Raises:
             InputError: The source cannot be read on.
+            StreamError: An event is at a place that EVT3 words cannot have.
         """
         try:
             for events, triggers in stream_until_stopped(self._source, stopped):
+                if (place := max(events.x.max(initial=0), events.y.max(initial=0))) >= MAX_SIDE:
+                    what = f"an event in column or row {place}, expected 0 to {MAX_SIDE - 1}"
+                    raise StreamError(f"{self._source.path}: {what}")
                 self.counts["events"] += len(events)
                 self._publisher.publish("events", 0.0, (events, triggers))
                 if stopped():

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.errors import InputError, OutputError
+from evlcp_sdk.errors import InputError, OutputError, StreamError
 from evlcp_sdk.io import open_source, write_events
 from evlcp_sdk.live.sender import Sender
 from evlcp_sdk.values import Events, Triggers
@@ -52,6 +52,13 @@ def test_what_is_sent_is_received(recording: Path, tmp_path: Path) -> None:
         assert triggers.t_us.tolist() == [40_000_500, 40_059_998]
     assert not (tmp_path / "s").exists()
     assert sender.counts["events"] == len(EVENTS)
+
+
+def test_what_words_cannot_say_is_not_sent(tmp_path: Path) -> None:
+    write_events(tmp_path / "a.csv", Events.of([1, 2], [7, 3000], [7, 7], [1, 0]))
+    wrong = pytest.raises(StreamError, match="an event in column or row 3000, expected 0 to 2047")
+    with open_source(tmp_path / "a.csv") as source, Sender(source, ("localhost", 0)) as sender, wrong:
+        sender.run()
 
 
 def test_where_it_cannot_listen_is_reported(recording: Path) -> None:
