@@ -28,9 +28,6 @@ enum evlcp_status on_save(struct evlcp *e, struct exchange *x)
     bool valid[EVLCP_SLOTS];
     if (autostart > 1u)
         return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, &x->detail, 1u);
-    /* Erasing stops the processor on single-bank parts: chips would come late, a LED test would stand still. */
-    if (atomic_load(&e->player.running) || atomic_load(&e->player.want_play) || e->test.on)
-        return EVLCP_STATUS_BUSY;
     if (active == EVLCP_NO_BANK || e->banks.stream[active].on)
         return EVLCP_STATUS_NOTHING_COMMITTED;
     /* Into the slot that is empty or older: the newest stays if the power fails meanwhile. */
