@@ -53,19 +53,6 @@ static uint16_t frame_mask(const struct evlcp_cursor *c)
     return (uint16_t)mask;
 }
 
-/* Four bytes at once, in any order and at any place: the chip interrupt does this up to 264 times a chip. */
-static uint32_t load(const uint8_t *from)
-{
-    uint32_t word;
-    __builtin_memcpy(&word, from, sizeof word);
-    return word;
-}
-
-static void store(uint8_t *to, uint32_t word)
-{
-    __builtin_memcpy(to, &word, sizeof word);
-}
-
 /* The LEDs of the clusters whose bits are set; masks of clusters do not overlap. */
 static void row_of_clusters(const struct evlcp_plan *plan, const uint8_t *masks, const uint8_t *bits,
                             uint8_t row[EVLCP_ROW_BYTES])
@@ -79,18 +66,18 @@ static void row_of_clusters(const struct evlcp_plan *plan, const uint8_t *masks,
         /* No bit beyond the last cluster: there is no mask. */
         for (uint32_t byte = (uint32_t)*bits >> (8u - here) << (8u - here); byte != 0u; byte = byte << 1 & 0xffu) {
             if ((byte & 0x80u) != 0u) {
-                a |= load(mask);
-                b |= load(mask + 4);
-                c |= load(mask + 8);
+                a |= evlcp_get32(mask);
+                b |= evlcp_get32(mask + 4);
+                c |= evlcp_get32(mask + 8);
             }
             mask += EVLCP_ROW_BYTES;
         }
         masks += here * EVLCP_ROW_BYTES;
         left -= here;
     }
-    store(row, a);
-    store(row + 4, b);
-    store(row + 8, c);
+    evlcp_put32(row, a);
+    evlcp_put32(row + 4, b);
+    evlcp_put32(row + 8, c);
 }
 
 bool evlcp_cursor_row(struct evlcp_cursor *cursor, uint8_t row[EVLCP_ROW_BYTES])

@@ -116,31 +116,35 @@ static inline void evlcp_copy(uint8_t *to, const uint8_t *from, uint32_t n)
         to[i] = from[i];
 }
 
+/* Numbers are little-endian on the wire, as on the processors that this is for, and stand at any address. */
+_Static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "numbers and payloads are copied as they are");
+
 static inline void evlcp_put16(uint8_t *p, uint16_t v)
 {
-    p[0] = (uint8_t)v;
-    p[1] = (uint8_t)(v >> 8);
+    __builtin_memcpy(p, &v, sizeof v);
 }
 
 static inline void evlcp_put32(uint8_t *p, uint32_t v)
 {
-    evlcp_put16(p, (uint16_t)v);
-    evlcp_put16(p + 2, (uint16_t)(v >> 16));
+    __builtin_memcpy(p, &v, sizeof v);
 }
 
 static inline uint16_t evlcp_get16(const uint8_t *p)
 {
-    return (uint16_t)(p[0] | (uint16_t)(p[1] << 8));
+    uint16_t v;
+    __builtin_memcpy(&v, p, sizeof v);
+    return v;
 }
 
 static inline uint32_t evlcp_get32(const uint8_t *p)
 {
-    return evlcp_get16(p) | (uint32_t)evlcp_get16(p + 2) << 16;
+    uint32_t v;
+    __builtin_memcpy(&v, p, sizeof v);
+    return v;
 }
 
-/* A payload as it is on the wire: packed and little-endian, as are the processors that this is for. */
+/* A payload as it is on the wire. */
 #define EVLCP_PAYLOAD __attribute__((packed, may_alias))
-_Static_assert(__BYTE_ORDER__ == __ORDER_LITTLE_ENDIAN__, "payloads are structures");
 
 /* Open a session and learn the board. Its first two fields never change between versions. */
 struct EVLCP_PAYLOAD evlcp_hello_request {
