@@ -16,7 +16,7 @@ from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, echo, print_json, print_result, progress_bar
 from evlcp_sdk.cli._stderr import print_stderr
-from evlcp_sdk.errors import ConfigError, InputError, name_place
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, name_place
 from evlcp_sdk.files import Outputs, check_output
 from evlcp_sdk.signals import stop_on_request
 from firmware_host.commands import _firmware, _host as host
@@ -419,20 +419,29 @@ def _watch_fleet(
 ) -> None:
     """Watch all boards of an inventory until Ctrl-C, or until each has had `count` statuses.
 
-    `quiet` prints only lost and returned boards.
+    `quiet` prints only lost and returned boards. One that fails is reported, and the others are watched on.
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    ended, printing = threading.Event(), threading.Lock()
+    ended, printing, codes = threading.Event(), threading.Lock(), list[int]()
 
     def watch_entry(entry: host.fleet.FleetEntry) -> None:
-        for event in host.monitor.watch_board(
-            partial(host.fleet.open_entry, entry, path.parent), interval, count, reconnect, reconnect, ended
-        ):
-            if quiet and isinstance(event, host.requests.StatusReply):
-                continue
+        which = {"id": entry.id, "port": entry.port}
+        try:
+            for event in host.monitor.watch_board(
+                partial(host.fleet.open_entry, entry, path.parent),
+                *(interval, count, reconnect, reconnect, ended),
+            ):
+                if quiet and isinstance(event, host.requests.StatusReply):
+                    continue
+                with printing:
+                    _print_event(event, which, as_json)
+        except EvlcpError as fault:
+            codes.append(fault.exit_code)
             with printing:
-                _print_event(event, {"id": entry.id, "port": entry.port}, as_json)
+                if as_json:
+                    print_json(which | fault_table(fault))
+                print_stderr(f"{entry.id}: {fault}")
 
     with ThreadPoolExecutor(len(entries)) as pool:
         watches = [pool.submit(watch_entry, entry) for entry in entries]
@@ -443,6 +452,8 @@ def _watch_fleet(
             return
         finally:
             ended.set()
+    if codes:
+        raise typer.Exit(codes[0])
 
 
 def _print_event(

@@ -145,5 +145,10 @@ def test_another_board_on_the_port_is_refused(evlcp, tmp_path):
     done = evlcp("board", "program", "--inventory", file)
     assert done.code == 8
     assert "the inventory expects" in done.out
+    wrong, other = file.read_text(), GOOD.replace('"a"', '"b"')
+    file.write_text(wrong + other)
+    done = evlcp("board", "monitor", "--inventory", file, "--interval", 0.05, "--count", 3)
+    assert (done.code, done.out.count("b  ")) == (8, 3), "the other board is watched on"
+    assert done.err.startswith("evlcp: a: native:: unique_id")
     file.write_text(GOOD + f'unique_id = "{"0" * 24}"\n')
     well(evlcp("board", "program", "--inventory", file))
