@@ -1,9 +1,8 @@
 """Generates C headers, Python modules and a page of the docs from `protocol.toml` and the codebook.
 
-`python -m firmware_host.protocol.generate` writes them; `--check` only names stale ones and ends with 1.
+`python -m firmware_host.protocol.generate` writes them.
 """
 
-import argparse
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -154,20 +153,13 @@ def render_files() -> dict[Path, str]:
     return files
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Write the generated files, or with `--check` name the stale ones and return 1."""
-    parser = argparse.ArgumentParser(prog="python -m firmware_host.protocol.generate", description=__doc__)
-    parser.add_argument("--check", action="store_true", help="only say which files are stale")
-    check = parser.parse_args(arguments).check
-    stale = [p for p, text in render_files().items() if not p.exists() or p.read_text() != text]
-    for path in stale:
-        if check:
-            sys.stderr.write(f"{path.name} is stale: run python -m firmware_host.protocol.generate\n")
-        else:
-            path.write_text(render_files()[path])
+def main() -> None:
+    """Write the generated files that are stale."""
+    for path, text in render_files().items():
+        if not path.exists() or path.read_text() != text:
+            path.write_text(text)
             sys.stdout.write(f"wrote {path.name}\n")
-    return int(check and bool(stale))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -30,13 +30,9 @@ def definition():
     return tomllib.loads((generate.HERE / "protocol" / "protocol.toml").read_text())
 
 
-def test_generated_files_are_fresh(monkeypatch, capsys):
-    assert generate.main(["--check"]) == 0, "run python -m firmware_host.protocol.generate"
-    files = generate.render_files()
-    first = next(iter(files))
-    monkeypatch.setattr(generate, "render_files", lambda: files | {first: "other"})
-    assert generate.main(["--check"]) == 1
-    assert first.name in capsys.readouterr().err
+def test_generated_files_are_fresh():
+    stale = [path.name for path, text in generate.render_files().items() if path.read_text() != text]
+    assert not stale, "run python -m firmware_host.protocol.generate"
 
 
 def test_what_comes_later_stands_at_the_end():

@@ -930,12 +930,11 @@ union vector {
 };
 
 __attribute__((section(".vectors"), used)) static const union vector vectors[16 + 82] = {
-    {.stack = link_stack},      {.handler = reset_handler}, {.handler = clock_handler},
-    {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
-    {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
-    {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
-    {.handler = fault_handler}, {.handler = fault_handler}, {.handler = fault_handler},
-    {.handler = silence_handler},
+    [0] = {.stack = link_stack},
+    [1] = {.handler = reset_handler},
+    [2] = {.handler = clock_handler},
+    [3 ... 14] = {.handler = fault_handler},
+    [15] = {.handler = silence_handler},
     [16 + IRQ_PVD] = {.handler = supply_handler},
     [16 + IRQ_USART1] = {.handler = receive_handler},
     [16 + IRQ_DMA2_STREAM5] = {.handler = chip_handler},
