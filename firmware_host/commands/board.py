@@ -173,7 +173,6 @@ def program(
 
 
 def _check_inventory_options(context: typer.Context, *allowed: str) -> None:
-
     given = [
         "/".join([*parameter.opts, *parameter.secondary_opts])
         for parameter in context.command.get_params(context)

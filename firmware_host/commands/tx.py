@@ -86,7 +86,6 @@ def _format_hex(symbols: NDArray[np.int64], link: sdk.resolve.Link) -> str:
 
 
 def _format_json(symbols: NDArray[np.int64], link: sdk.resolve.Link) -> str:
-
     info = _format_words(link.codebook.codewords)
     return json.dumps(
         host.symbols.symbols_table(symbols, link)
@@ -98,7 +97,6 @@ def _format_json(symbols: NDArray[np.int64], link: sdk.resolve.Link) -> str:
 
 
 def _format_c(symbols: NDArray[np.int64], link: sdk.resolve.Link) -> str:
-
     book = link.codebook
     bits = next((n for n in (16, 32, 64) if n >= link.packet.info_chips), None)
     if bits is None:
