@@ -76,13 +76,14 @@ class SimulatedSource(EventSource):
             raise StreamError(f"{out}: the simulation has been read already; simulate it again to save it")
         truth_file = truth_path(out)
         check_output(truth_file)
+        # What they refuse is reported before the rendering.
+        survey = _survey_files(simulation, out)
         with Outputs() as outputs:
             with open_writer(out, self.width, self.height, "EVT3", outputs) as writer:
                 for events in self._pieces:
                     writer.write(events)
                     if advance is not None:
                         advance(simulation.done_s)
-            survey = _survey_files(simulation, out)
             for path, text in survey.items():
                 outputs.write_text(text, path)
             size = outputs.path(out).stat().st_size

@@ -134,6 +134,9 @@ class BarLight:
         self._chips: NDArray[np.uint8] | None = None
         self._packets: dict[int, NDArray[np.uint8]] = {}
         self._transmitter_id = transmitter_id
+        for key, payload in (("symbols", "symbols"), ("text", "messages")):
+            if getattr(bar, key) is not None and bar.payload != payload:
+                raise ConfigError(f"{source}.payload = {bar.payload!r}: expected {payload!r} beside {key}")
         if bar.chips_file is not None:
             self._chips = _read_chips(Path(bar.chips_file), link.codebook.clusters)
             self.packet_chips = len(self._chips)
@@ -247,10 +250,6 @@ class BarLight:
 
     def _check_symbols(self, bar: BarSpec, source: str) -> None:
         assert bar.symbols is not None
-        if bar.payload != "symbols":
-            raise ConfigError(
-                f"{source}.payload = {bar.payload!r}: expected 'symbols' where symbols are given"
-            )
         for q, packet in enumerate(bar.symbols):
             frames = self.link.packet.frames
             if len(packet) != frames:

@@ -142,6 +142,7 @@ def test_a_bar_in_the_world_sends_its_beacon() -> None:
         ({"payload": "data", "link": {"air": {"frames_per_packet": 2}}}, "bars.0: .* expected at least"),
         ({"link": {"error-correction": {"id": "pole"}}}, "bars.0.link: .*did you mean 'polar'"),
         ({"payload": "data", "symbols": [[[0] * 16] * 10]}, "bars.0.payload = 'data': expected 'symbols'"),
+        ({"text": "hi"}, "bars.0.payload = 'symbols': expected 'messages' beside text"),
     ],
 )
 def test_what_cannot_be_sent_is_reported(bar: dict[str, Any], message: str) -> None:
