@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -132,7 +133,9 @@ class BarLight:
         # Codes are constant for two chips at most, half their amplitude from their mean.
         self.longest_us = 1e6 / self.rate_hz
         self._chips: NDArray[np.uint8] | None = None
-        self._packets: dict[int, NDArray[np.uint8]] = {}
+        self._make_packet = lru_cache(64)(
+            lambda q: packet_chips(self.symbols(q), link.codebook, link.packet.pilot_every)
+        )
         self._transmitter_id = transmitter_id
         for key, payload in (("symbols", "symbols"), ("text", "messages")):
             if getattr(bar, key) is not None and bar.payload != payload:
@@ -300,13 +303,7 @@ class BarLight:
         if self._chips is not None:
             return self._chips[np.arange(first, last) % len(self._chips)]
         begin, end = first // self.packet_chips, (last - 1) // self.packet_chips + 1
-        self._packets = {
-            q: self._packets[q]
-            if q in self._packets
-            else packet_chips(self.symbols(q), self.link.codebook, self.link.packet.pilot_every)
-            for q in range(begin, end)
-        }
-        rows = np.concatenate([self._packets[q] for q in range(begin, end)])
+        rows = np.concatenate([self._make_packet(q) for q in range(begin, end)])
         return rows[first - begin * self.packet_chips : last - begin * self.packet_chips]
 
     def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
