@@ -24,7 +24,7 @@ def tpv(fix: Fix, filtered: Place | None, zero: datetime | None) -> dict[str, An
     """
     report: dict[str, Any] = {"class": "TPV", "device": DEVICE, "mode": 1 if filtered is None else 3}
     if zero is not None:
-        report["time"] = _time(zero, fix.t_us)
+        report["time"] = format_time(zero, fix.t_us)
     if filtered is None:
         return report
     east, north, up = sigmas(filtered.covariance_m2)
@@ -52,7 +52,7 @@ def sky(fix: Fix, zero: datetime | None) -> dict[str, Any]:
     bars = [{"PRN": number, "used": used} for number in fix.transmitters]
     report: dict[str, Any] = {"class": "SKY", "device": DEVICE, "nSat": len(bars), "uSat": len(bars) * used}
     if zero is not None:
-        report["time"] = _time(zero, fix.t_us)
+        report["time"] = format_time(zero, fix.t_us)
     return report | {"satellites": bars}
 
 
@@ -92,6 +92,7 @@ def answer_request(
     return [{"class": "DEVICES", "devices": [device]}, {"class": "WATCH", **watch}]
 
 
-def _time(zero: datetime, t_us: float) -> str:
+def format_time(zero: datetime, t_us: float) -> str:
+    """A time of the camera's clock as UTC in ISO 8601, to the nearest millisecond."""
     at = zero.astimezone(UTC) + timedelta(milliseconds=math.floor(t_us / 1000 + 0.5))
     return f"{at:%Y-%m-%dT%H:%M:%S}.{at.microsecond // 1000:03d}Z"

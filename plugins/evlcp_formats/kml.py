@@ -4,12 +4,12 @@ Altitudes in KML are above mean sea level, the geoid of EGM96.
 """
 
 from collections.abc import Sequence
-from datetime import UTC, timedelta
 from xml.sax.saxutils import escape
 
 from evlcp_sdk.place.gnss import geoid_m
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.gpsd import format_time
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.trail import Trail
 from evlcp_sdk.utc import clock_zero_at
@@ -38,10 +38,7 @@ class Kml(Sink):
             return
         east, north, up = sigmas(fix.covariance_m2)
         zero = clock_zero_at(self.run.clock_zero, fix.t_us)
-        when = ""
-        if zero is not None:
-            at = zero.astimezone(UTC) + timedelta(microseconds=round(fix.t_us))
-            when = f"<TimeStamp><when>{at:%Y-%m-%dT%H:%M:%S}.{at.microsecond // 1000:03d}Z</when></TimeStamp>"
+        when = "" if zero is None else f"<TimeStamp><when>{format_time(zero, fix.t_us)}</when></TimeStamp>"
         name = f"<name>{fix.t_us / 1e3:.1f} ms</name>"
         label = f"&#177; {east:.3f} E {north:.3f} N {up:.3f} U m"
         where = _format_point(fix.longitude_deg, fix.latitude_deg, fix.height_m)
