@@ -639,7 +639,7 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
         x->in = whole;
         x->in_length = shape->bytes;
     }
-    if (shape->handle == on_hello) {
+    if (d->type == EVLCP_TYPE_HELLO) {
         enum evlcp_status status = on_hello(e, x);
         if (status == EVLCP_STATUS_OK && trusted)
             note_host(e);
@@ -654,7 +654,7 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
         return EVLCP_STATUS_NEEDS_KEY;
     if (trusted) {
         note_host(e);
-        if (shape->handle != on_status)
+        if (d->type != EVLCP_TYPE_STATUS)
             e->watch.silence_from_ms = e->watch.host_ms;
     }
     if (trusted && is_after(d->sequence, c->newest)) {
@@ -678,7 +678,7 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
     if (shape->control)
         return run_control(e, shape, x);
     enum evlcp_status status = run(e, shape, x);
-    if (trusted && shape->handle == on_status)
+    if (trusted && d->type == EVLCP_TYPE_STATUS)
         e->watch.silence_from_ms = e->watch.host_ms; /* after it, as the status reports the silence */
     return status;
 }
@@ -830,6 +830,9 @@ void evlcp_poll(struct evlcp *e)
         answer(e, &datagram);
         (void)evlcp_link_flush(&e->link);
     }
+    uint32_t lost = hal_lost_bytes();
+    if (lost != 0u)
+        atomic_fetch_add(&e->link.overflow_errors, lost);
     if (!is_running(e)) {
         (void)evlcp_banks_swap(&e->banks);
         if (atomic_load(&e->player.chip_lost) || atomic_load(&e->player.over_limit))

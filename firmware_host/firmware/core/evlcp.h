@@ -90,7 +90,7 @@ struct exchange {
 /* Begin, in memory that is zero: LEDs dark, no session; a flash slot saved with autostart is recalled and played. */
 void evlcp_init(struct evlcp *e);
 
-/* Bytes were received; the HAL adds those that its receiver lost to link.overflow_errors, there, too. */
+/* Bytes were received. */
 void evlcp_receive(struct evlcp *e, const uint8_t *bytes, uint32_t count);
 
 /* A chip is due. */

@@ -80,6 +80,9 @@ bool hal_random(uint8_t *bytes, uint32_t count);
 /* Take bytes to send; returns how many were taken, and never waits. */
 uint32_t hal_send(const uint8_t *bytes, uint32_t count);
 
+/* Bytes that the receiver hardware lost since the last call. */
+uint32_t hal_lost_bytes(void);
+
 /* Set the LED current; false if the hardware does not follow. */
 bool hal_set_level(uint16_t level_ma);
 

@@ -23,6 +23,35 @@
 #define EVLCP_CHIP_DARK 0xffffffffu /* Chip number in an LED record: output is dark, no chip. */
 #define EVLCP_CHIP_TEST 0xfffffffeu /* Chip number in an LED record: single-LED test, no chip. */
 
+enum evlcp_type {
+    EVLCP_TYPE_HELLO = 0x01,
+    EVLCP_TYPE_CONFIGURE = 0x02,
+    EVLCP_TYPE_CODEBOOK = 0x03,
+    EVLCP_TYPE_WRITE = 0x04,
+    EVLCP_TYPE_READ = 0x05,
+    EVLCP_TYPE_CRC = 0x06,
+    EVLCP_TYPE_COMMIT = 0x07,
+    EVLCP_TYPE_START = 0x08,
+    EVLCP_TYPE_STOP = 0x09,
+    EVLCP_TYPE_BLANK = 0x0a,
+    EVLCP_TYPE_LEVEL = 0x0b,
+    EVLCP_TYPE_STATUS = 0x0c,
+    EVLCP_TYPE_WATCHDOG = 0x0d,
+    EVLCP_TYPE_SAVE = 0x0e,
+    EVLCP_TYPE_RECALL = 0x0f,
+    EVLCP_TYPE_LED_TEST = 0x10,
+    EVLCP_TYPE_STREAM = 0x18,
+    EVLCP_TYPE_PUSH = 0x19,
+    EVLCP_TYPE_KEY = 0x1a,
+    EVLCP_TYPE_CHIPS = 0x1b,
+    EVLCP_TYPE_UPDATE_STATUS = 0x20,
+    EVLCP_TYPE_UPDATE_BEGIN = 0x21,
+    EVLCP_TYPE_UPDATE_WRITE = 0x22,
+    EVLCP_TYPE_UPDATE_COMMIT = 0x23,
+    EVLCP_TYPE_UPDATE_RESTART = 0x24,
+    EVLCP_TYPE_UPDATE_CONFIRM = 0x25,
+};
+
 /* How a request ended. */
 enum evlcp_status {
     EVLCP_STATUS_OK = 0, /* Done. */

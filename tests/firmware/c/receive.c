@@ -30,7 +30,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         return 0;
     struct native *board = board_new(id);
     const uint8_t hello[sizeof(struct evlcp_hello_request)] = {EVLCP_PROTOCOL_MAJOR, EVLCP_PROTOCOL_MINOR, 1u};
-    send_datagram(board, 0u, EVLCP_NO_SESSION, 0x01u, hello, sizeof hello);
+    send_datagram(board, 0u, EVLCP_NO_SESSION, EVLCP_TYPE_HELLO, hello, sizeof hello);
     if ((data[0] & 1u) == 0u) {
         for (size_t at = 1; at < size; at += 512u) {
             board_input(board, data + at, size - at < 512u ? size - at : 512u);

@@ -163,6 +163,11 @@ bool hal_random(uint8_t *bytes, uint32_t count)
     return getrandom(bytes, count, 0) == (ssize_t)count;
 }
 
+uint32_t hal_lost_bytes(void)
+{
+    return 0u;
+}
+
 bool hal_set_level(uint16_t level_ma)
 {
     if (!self->bench.level_fails)

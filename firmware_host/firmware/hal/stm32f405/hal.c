@@ -257,6 +257,8 @@ static uint32_t slot_cycles;
 static uint32_t last_count;
 static uint32_t count_rest;
 static uint32_t millis;
+static volatile uint32_t lost;
+static uint32_t reported_lost;
 
 void hal_get_info(struct evlcp_hal_info *info)
 {
@@ -621,6 +623,14 @@ bool hal_random(uint8_t *bytes, uint32_t count)
     return true;
 }
 
+uint32_t hal_lost_bytes(void)
+{
+    uint32_t total = lost;
+    uint32_t since = total - reported_lost;
+    reported_lost = total;
+    return since;
+}
+
 bool hal_set_level(uint16_t level_ma)
 {
     DAC_DHR12R1 = level_ma * DAC_FULL / LEVEL_MAX_MA;
@@ -807,7 +817,7 @@ static void receive_handler(void)
 {
     uint32_t status = USART_SR;
     if ((status & USART_OVERRUN) != 0u)
-        atomic_fetch_add(&board.link.overflow_errors, 1u);
+        lost++;
     if ((status & (USART_RECEIVED | USART_OVERRUN)) != 0u) {
         uint8_t byte = (uint8_t)USART_DR; /* the read clears both flags */
         if ((status & USART_RECEIVED) != 0u)
