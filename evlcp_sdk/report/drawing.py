@@ -92,7 +92,7 @@ def _draw_shape(axis: Axes, shape: Shape, *, legend: bool = False) -> Any:
     return axis.plot(x, y, ls=style, lw=0.75 * width, color=colour, zorder=3)[0]
 
 
-def save_plots(plots: Sequence[Plot], title: str, folder: Path, outputs: Outputs) -> list[Path]:
+def save_plots(plots: Sequence[Plot], title: str, folder: Path, outputs: Outputs) -> None:
     """Save charts as PNG and SVG, named by their id, in a folder that is created if needed.
 
     Raises:
@@ -100,12 +100,9 @@ def save_plots(plots: Sequence[Plot], title: str, folder: Path, outputs: Outputs
     """
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    written = []
     for plot in plots:
         figure = draw_plot(plot, title)
         for kind in ("png", "svg"):
             path = folder / f"{plot.id}.{kind}"
             with writing(path):
                 figure.savefig(outputs.path(path), format=kind, dpi=150)
-            written.append(path)
-    return written
