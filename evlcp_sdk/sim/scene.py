@@ -700,13 +700,18 @@ def _set_value(table: dict[str, Any], key: str, value: Any) -> None:
     if len(parts) > (3 if parts[0] == "link" else 1 if parts is rest else 2):
         raise ConfigError(f"--set {key}: expected table.key, or link.TABLE.KEY, e.g. link.air.chip_rate_hz")
     for holder in holders:
-        *tables, last = parts
-        for name in tables:
-            inner = holder.get(name, {})
-            if not isinstance(inner, dict):
-                raise ConfigError(f"--set {key}: {name} = {inner!r}: expected a table")
-            holder[name] = copy(inner)
-            holder = holder[name]
-        holder[last] = value.item() if isinstance(value, np.generic) else value
-        if tables[-1:] == ["bar"] and last == "leds_file":
-            holder.pop("leds", None)
+        _set_at(holder, parts, value.item() if isinstance(value, np.generic) else value, key)
+
+
+def _set_at(holder: dict[str, Any], parts: Sequence[str], value: Any, key: str) -> None:
+    """Set a value in a table, by the names of the tables in it on the way, which are copied."""
+    *tables, last = parts
+    for name in tables:
+        inner = holder.get(name, {})
+        if not isinstance(inner, dict):
+            raise ConfigError(f"--set {key}: {name} = {inner!r}: expected a table")
+        holder[name] = copy(inner)
+        holder = holder[name]
+    holder[last] = value
+    if tables[-1:] == ["bar"] and last == "leds_file":
+        holder.pop("leds", None)
