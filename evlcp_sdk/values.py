@@ -64,18 +64,18 @@ class Events:
 
     @classmethod
     def of(cls, t_us: Any, x: Any, y: Any, p: Any) -> Self:
-        """Events from array-likes, converted to the column types.
+        """Events from array-likes, converted to the column types; fractions of a microsecond are cut off.
 
         Raises:
-            StreamError: A value that its column cannot hold, such as a time in seconds, or -1 for a column.
+            StreamError: A value that its column cannot hold, such as a place of -1 or 65536.
         """
         columns = []
         for (name, dtype), given in zip(_COLUMNS, (t_us, x, y, p), strict=True):
             values = np.asarray(given)
             with np.errstate(invalid="ignore"):
                 columns.append(np.ascontiguousarray(values.astype(dtype, copy=False)))
-            if values.dtype != dtype and (changed := values != columns[-1]).any():
-                raise StreamError(f"events column {name}: {values[changed][0]}, expected {dtype}")
+            if values.dtype != dtype and not (held := np.abs(values - columns[-1]) < 1).all():
+                raise StreamError(f"events column {name}: {values[~held][0]}, expected {dtype}")
         return cls(*columns)
 
     @classmethod
