@@ -160,9 +160,7 @@ class CameraOptions:
     heading_deg: Annotated[
         float | None, typer.Option(metavar="DEG", help="The camera's heading, clockwise from north.")
     ] = None
-    pitch_deg: Annotated[
-        float | None, typer.Option(min=-89, max=89, metavar="DEG", help="Its pitch, up.")
-    ] = None
+    pitch_deg: Annotated[float | None, typer.Option(metavar="DEG", help="Its pitch, up.")] = None
     roll_deg: Annotated[float | None, typer.Option(metavar="DEG", help="Its roll, top to the right.")] = None
     heading_sigma_deg: Annotated[
         float, typer.Option(min=0, hidden=True, help="Sigma of the heading, unless a file has it.")
@@ -210,6 +208,8 @@ class CameraOptions:
             if isinstance(value, float) and not math.isfinite(value):
                 option = f"--{name.replace('_', '-')}"
                 raise typer.BadParameter(f"{value}: expected a finite number", param_hint=option)
+        if pitch is not None and abs(pitch) > 89:
+            raise typer.BadParameter(f"{pitch}: expected -89 to 89", param_hint="--pitch-deg")
         if place.attitude_file is not None:
             return sdk.attitude.AttitudeLog.read(
                 place.attitude_file, sdk.attitude.Attitude(0.0, 0.0, None, *sigmas)

@@ -161,7 +161,7 @@ SITES = [BarSite(1, 35.1, 137.0, 50.0)]
         ("- -o OUT --link auto", "standard input is read once"),
         ("REC -o OUT --sites S --heading-deg 3", "a heading needs gravity"),
         ("REC -o OUT --sites S --attitude a.csv --pitch-deg 3 --roll-deg 0", "not both"),
-        ("REC -o OUT --pitch-deg 90 --roll-deg 0", "less than or equal to 89"),
+        ("REC -o OUT --pitch-deg 90 --roll-deg 0", "90.0: expected -89 to 89"),
         ("REC -o OUT --sites S --clock-zero noon", "expected a time such as"),
         ("REC -o OUT --sites S --clock-zero 9999-12-31T23:59:59.9", "expected 1970 to 2199"),
         ("REC -o OUT --sites none.toml", "none.toml: cannot be read"),

@@ -44,7 +44,8 @@ def recording():
 def growing_together():
     """A bar comes nearer to another by a column a step."""
     _, near = lit(3, 2, x_px=440, start_us=10_000)
-    moved = Events.of(near.t_us, near.x - np.minimum(near.t_us // 1500, 40), near.y, near.p)
+    x = (near.x - np.minimum(near.t_us // 1500, 40)).astype(np.uint16)
+    moved = Events.of(near.t_us, x, near.y, near.p)
     return merge_events(lit(3, 1)[1], moved)
 
 
