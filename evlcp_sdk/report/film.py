@@ -100,13 +100,13 @@ class Footage:
     regions: Sequence[Region] = ()
 
 
-def count_pictures(for_ms: float, slow: float) -> int:
-    """Number of pictures of a film of some time.
+def count_pictures(for_ms: float, slow: float) -> float:
+    """Number of pictures of a film of some time; infinite of endless slow motion.
 
     >>> count_pictures(40, slow=100)
-    100
+    100.0
     """
-    return max(1, math.ceil(for_ms * 1e-3 * PICTURES_PER_S * slow - 1e-9))
+    return max(float(np.ceil(for_ms * 1e-3 * PICTURES_PER_S * slow - 1e-9)), 1.0)
 
 
 def check_film(out: Path, for_ms: float, slow: float) -> FilmKind:
@@ -119,7 +119,7 @@ def check_film(out: Path, for_ms: float, slow: float) -> FilmKind:
         raise ConfigError(f"{out}: a film is written as {' or '.join(f'NAME{end}' for end in FILM_KINDS)}")
     if kind == "MP4":
         import_extra("av", "mp4", str(out))
-    pictures = for_ms * 1e-3 * PICTURES_PER_S * slow - 1e-9
+    pictures = count_pictures(for_ms, slow)
     if not pictures <= MAX_PICTURES:
         raise ConfigError(
             f"{for_ms:g} ms at 1/{slow:g} would be {pictures:g} pictures, at most {MAX_PICTURES}: show less,"
@@ -217,7 +217,7 @@ def plan_film(
         left, right = _clamp_range(float(middle[0]), float(columns), camera.width)
         top, bottom = _clamp_range(float(middle[1]), float(rows), camera.height)
     scale = min(longest_px / max(right - left, bottom - top), _MAX_SCALE)
-    pictures = count_pictures(for_us * 1e-3, slow)
+    pictures = int(count_pictures(for_us * 1e-3, slow))
     film = Film(footage.start_us, pictures, left, top, right - left, bottom - top, scale, slow)
     width, height = film.size_px
     if (megapixels := pictures * width * height * 1e-6) > MAX_MEGAPIXELS:
