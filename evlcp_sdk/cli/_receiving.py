@@ -208,8 +208,9 @@ class CameraOptions:
             if isinstance(value, float) and not math.isfinite(value):
                 option = f"--{name.replace('_', '-')}"
                 raise typer.BadParameter(f"{value}: expected a finite number", param_hint=option)
-        if pitch is not None and abs(pitch) > 89:
-            raise typer.BadParameter(f"{pitch}: expected -89 to 89", param_hint="--pitch-deg")
+        low, high = sdk.attitude.PITCH_DEG
+        if pitch is not None and not low <= pitch <= high:
+            raise typer.BadParameter(f"{pitch}: expected {low:g} to {high:g}", param_hint="--pitch-deg")
         if place.attitude_file is not None:
             return sdk.attitude.AttitudeLog.read(
                 place.attitude_file, sdk.attitude.Attitude(0.0, 0.0, None, *sigmas)

@@ -22,13 +22,16 @@ _GRAVITY_M_S2 = 9.80665
 _LARGEST_READING = 1e5
 """A rate, degrees/s, or force, m/s2, above any sensor's range."""
 
-_NEEDED = {"t_us": ANY_NUMBER, "pitch_deg": (-89.0, 89.0), "roll_deg": ANY_NUMBER}
+PITCH_DEG = -89.0, 89.0
+"""Range of a camera's pitch: who looks straight up or down has no heading."""
+
+_NEEDED = {"t_us": ANY_NUMBER, "pitch_deg": PITCH_DEG, "roll_deg": ANY_NUMBER}
 _OPTIONAL = {
     "heading_deg": ANY_NUMBER,
     **dict.fromkeys(("gravity_sigma_deg", "heading_sigma_deg"), (0.0, math.inf)),
     **dict.fromkeys(_RATES + _FORCES, (-_LARGEST_READING, _LARGEST_READING)),
 }
-"""Columns, and the range of their values: who looks straight up or down has no heading."""
+"""Columns, and the range of their values."""
 
 _GAP_INTERVALS = 10.0
 """Time between two lines, in median intervals, above which lines are lost; jitter of clocks and buffers makes
