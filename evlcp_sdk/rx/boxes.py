@@ -97,6 +97,17 @@ def box_of(region: Region) -> Box:
     return box_around(region.x_px, region.y_px, region.width_px, region.height_px)
 
 
+def clip_box(box: Box, size_px: tuple[int, int]) -> Box:
+    """The part of a box that is on a sensor of so many columns and rows; an empty one off it."""
+    (left, top, right, bottom), (width, height) = box, size_px
+    return (
+        min(max(left, 0), width),
+        min(max(top, 0), height),
+        min(max(right, 0), width),
+        min(max(bottom, 0), height),
+    )
+
+
 def grow_box(box: Box, seam_px: int) -> Box:
     """Extend a box to each side, not beyond the sensor's first row and column."""
     left, top, right, bottom = box

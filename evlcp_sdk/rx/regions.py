@@ -21,6 +21,7 @@ from evlcp_sdk.rx.boxes import (
     box_around,
     box_of,
     boxes_overlap,
+    clip_box,
     count_hits,
     cut_neighbours,
     find_areas,
@@ -845,8 +846,7 @@ class RhythmTracker(RegionTracker):
         left, top = int(x_px - half_w), int(y_px - half_h)
         right, bottom = int(x_px + half_w) + 1, int(y_px + half_h) + 1
         if left < 0 or top < 0 or right > width or bottom > height:
-            left, right = min(max(left, 0), width), min(max(right, 0), width)
-            top, bottom = min(max(top, 0), height), min(max(bottom, 0), height)
+            return clip_box((left, top, right, bottom), self._sensor_px)
         return left, top, right, bottom
 
     def _measure_place(
@@ -900,7 +900,8 @@ class RhythmTracker(RegionTracker):
             areas, left_out = find_areas(hits, self._limits.areas, self._sensor_px)
             self.counts["areas_left_out"] += left_out
             places = [self._measure_place(None, area, end_us) for area in areas]
-            lit = [box_around(*place) for place in places if place is not None]
+            # The mean column is not in the middle: half of the width to one side may be off the sensor.
+            lit = [clip_box(box_around(*place), self._sensor_px) for place in places if place is not None]
             boxes = [box for box in join_boxes(lit, merge_px) if count_hits(hits, box) >= _MIN_RISES]
         if rises:
             hits[:] = 0

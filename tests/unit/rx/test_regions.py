@@ -88,6 +88,21 @@ def test_a_bar_that_leaves_the_image_fast_is_let_go(way):
     assert not regions.alive
 
 
+def test_a_bar_at_the_edge_is_sought_on_the_sensor(monkeypatch):
+    """Its light and a faint halo to the left: half of their width to the right of the mean is off it."""
+    boxes, measure = [], BlinkDetector.measure
+    monkeypatch.setattr(
+        BlinkDetector, "measure", lambda self, box, *a: boxes.append(box) or measure(self, box, *a)
+    )
+    x, halo = BAR_EVENTS.x.astype(np.int64) + 1279 - BAR_EVENTS.x.max(), BAR_EVENTS.y % 16 == 0
+    left = [
+        in_order(BAR_EVENTS.t_us[halo], x[halo] - by, BAR_EVENTS.y[halo], BAR_EVENTS.p[halo]) for by in (4, 8)
+    ]
+    bar = Events.of(BAR_EVENTS.t_us, x, BAR_EVENTS.y, BAR_EVENTS.p)
+    assert follow(merge_events(bar, *left), 10_000)[9000]
+    assert max(box[2] for box in boxes) == 1280
+
+
 @pytest.mark.parametrize("shows_again", [False, True])
 def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_again):
     """Its lower quarter is hidden, for a while or all the time; one pixel in four above it blinks, too."""
