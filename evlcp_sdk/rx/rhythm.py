@@ -129,6 +129,9 @@ def _relate_times() -> NDArray[np.int64]:
     return relations
 
 
+_MOST_SELECTED = 2**21
+"""Events that there is room for in one pass over a step, 27 MB: each box has room for all of the step."""
+
 _SEAM_PX = 2
 """Columns at either side of a box that a bar should leave dark: some of the least seam of a region."""
 
@@ -222,11 +225,11 @@ class BlinkDetector:
             rhythmic: Boxes of which only candidates' events are selected that are no lamps.
             most_repeats: Repetitions of a time from which on a candidate is a lamp.
         """
-        most = _kernels.MAX_BOXES
+        columns, stride = (events.t_us, events.x, events.y, events.p), events.t_us.size
+        most = max(min(_MOST_SELECTED // (stride + 1), _kernels.MAX_BOXES), 1)
         if len(boxes) > most:
             first = self.select(events, boxes[:most], rhythmic[:most], most_repeats)
             return first + self.select(events, boxes[most:], rhythmic[most:], most_repeats)
-        columns, stride = (events.t_us, events.x, events.y, events.p), events.t_us.size
         room = len(boxes) * stride + 1
         if room > self._columns[0].size:
             room += room // 4
