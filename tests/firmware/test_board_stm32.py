@@ -11,7 +11,7 @@ from firmware_host import build
 from firmware_host.board.bank import Bank, make_bank, symbol_chips
 from firmware_host.board.board import Settings, provision
 from firmware_host.errors import RefusedError
-from firmware_host.protocol.generated.requests import BoardFault, State
+from firmware_host.protocol.generated.requests import BoardFault, State, Watchdog, WriteRequest
 
 pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
 from tests.models.stm32 import RESET_BY_IWDG, RESET_BY_PIN, US, Dma, Usart, connect, lit_rows
@@ -154,6 +154,16 @@ def test_stop_ends_in_the_dark_on_a_stream_that_dies_meanwhile(bar):
     assert bar.board.status().state == State.PLAYING
 
 
+def test_a_request_that_takes_long_to_check_is_no_silence(bar):
+    bar.board.set_key(bytes(range(1, 17)))
+    bar.board.set_watchdog(Watchdog.DARK, 60_000)
+    bar.board.start()
+    for phase in range(5):  # a millisecond ends while one is checked
+        bar.chip.run(1_000 - bar.chip.now / US % 1_000 + 200 * phase)
+        bar.board.session.call(WriteRequest(1, 0, bytes(400)))
+    assert state_of(bar.board) == (State.PLAYING, 0)
+
+
 def test_no_crystal_then_no_chip(bar):
     bar.chip.stop_crystal()
     bar.chip.run(1_000)
@@ -291,6 +301,9 @@ def test_counters_pass_two_to_the_32(bar):
     places = [n for n in range(0, len(memory), 4) if memory[n : n + 8] == pattern]
     # the counters, and after them the reply that has just told of them
     assert len(places) == 2
+    looks = symbol("hal_millis")
+    while 0 <= chip.pc - looks < 128:  # not while it looks at them
+        chip.run(0.1)
     chip.uc.mem_write(board + places[0], b"\xff\xff\xff\xff" + (2**32 - 60).to_bytes(4, "little"))
     last = symbol("last_count")
     chip.uc.mem_write(symbol("millis"), (2**32 - 25).to_bytes(4, "little"))

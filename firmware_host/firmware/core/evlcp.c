@@ -825,15 +825,18 @@ static bool is_start_due(struct evlcp *e)
 void evlcp_poll(struct evlcp *e)
 {
     struct evlcp_datagram datagram;
-    uint32_t now = hal_millis();
     if (evlcp_link_flush(&e->link) && evlcp_link_next(&e->link, &datagram)) {
         answer(e, &datagram);
         (void)evlcp_link_flush(&e->link);
     }
+    uint32_t now = hal_millis(); /* after the answer, which has its own: no time before it is compared with it */
     uint32_t lost = hal_lost_bytes();
     if (lost != 0u)
         atomic_fetch_add(&e->link.overflow_errors, lost);
     if (!is_running(e)) {
+        if (!e->player.rests)
+            e->player.dark_ms = now;
+        e->player.rests = true;
         (void)evlcp_banks_swap(&e->banks);
         if (atomic_load(&e->player.chip_lost) || atomic_load(&e->player.over_limit))
             atomic_store(&e->player.want_play, false);

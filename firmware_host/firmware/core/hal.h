@@ -71,7 +71,7 @@ bool hal_read_pulse(struct evlcp_pulse *pulse);
 /* Ticks between the moment the running chip call was due and now. */
 uint32_t hal_lateness(void);
 
-/* Milliseconds since reset, free to wrap. */
+/* Milliseconds since reset, free to wrap. Called by the main loop alone. */
 uint32_t hal_millis(void);
 
 /* Unpredictable random numbers; false if the board has none. */

@@ -86,6 +86,7 @@ void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks)
     if (player->halt)
         return; /* the end of a stream that has played */
     compose(player);
+    player->rests = false;
     atomic_store(&player->running, true);
     hal_set_chip_clock(plan->setup.ticks_per_chip);
 }
@@ -94,8 +95,7 @@ void evlcp_player_blank(struct evlcp_player *player)
 {
     hal_set_chip_clock(0u);
     hal_show_leds(dark, EVLCP_CHIP_DARK);
-    if (atomic_exchange(&player->running, false))
-        player->dark_ms = hal_millis();
+    atomic_store(&player->running, false);
 }
 
 void evlcp_player_chip(struct evlcp_player *player, struct evlcp_banks *banks)

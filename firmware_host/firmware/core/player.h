@@ -25,7 +25,8 @@ struct evlcp_player {
     uint32_t idle_left;
     uint32_t chip;
     uint32_t ticks_per_chip;
-    uint32_t dark_ms; /* since when it does not run */
+    bool rests; /* the main loop has seen that it does not run */
+    uint32_t dark_ms; /* since when */
     struct evlcp_guard guard;
     uint8_t row[EVLCP_ROW_BYTES];
     atomic_uint_least32_t packets_sent;
