@@ -90,6 +90,7 @@ def test_registers_are_those_of_the_schematic(bar):
     assert chip.spi.cr1 == 1 << 11 | 1 << 9 | 1 << 8 | 1 << 6 | 2 << 3 | 1 << 2
     bar.board.set_level(30)
     assert chip.plain[0x40007408] == 30 * 4095 // 60
+    assert chip.plain[0x40007000] == 1 << 14 | 0xD0  # the regulator for 168 MHz, the PVD at 2.8 V
     assert (bar.board.info.tick_hz, bar.board.info.hal.rstrip(b"\0")) == (14_000_000, b"stm32f405")
 
 
@@ -152,6 +153,15 @@ def test_stop_ends_in_the_dark_on_a_stream_that_dies_meanwhile(bar):
     # what works again plays again
     bar.play(15_000, 100)
     assert bar.board.status().state == State.PLAYING
+
+
+def test_a_supply_that_is_low_already_lights_nothing(bar):
+    bar.chip.plain[0x40007004] = 4  # the PVD's output, which does not interrupt while it stays so
+    for light in (bar.board.start, lambda: bar.board.test_leds(0, 0, 100)):
+        light()
+        bar.chip.run(1_000)
+        assert state_of(bar.board) == (State.FAULT, BoardFault.CHIP_LOST)
+    assert not any(s.row for s in bar.log)
 
 
 def test_a_request_that_takes_long_to_check_is_no_silence(bar):

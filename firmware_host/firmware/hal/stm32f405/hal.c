@@ -90,7 +90,10 @@
 #define IWDG_LONG 4095u    /* while a sector is erased, or at 16 MHz: the LEDs are dark then */
 
 #define PWR_CR REGISTER(0x40007000u)
-#define PVD_2V8 0x000000d0u /* level 6, on */
+#define PWR_CSR REGISTER(0x40007004u)
+#define PWR_SCALE_1 0x00004000u /* the regulator for 168 MHz; without it 144 MHz at most */
+#define PVD_2V8 0x000000d0u     /* level 6, on */
+#define PVD_LOW 0x4u
 #define EXTI 0x40013c00u
 #define EXTI_IMR REGISTER(EXTI + 0x00u)
 #define EXTI_RTSR REGISTER(EXTI + 0x08u)
@@ -294,13 +297,6 @@ static void outputs_off(void)
     GPIO_BSRR(GPIOB) = PIN(0);
 }
 
-static void outputs_on(void)
-{
-    GPIO_BSRR(GPIOB) = PIN_CLEAR(0);
-    if (failed) /* just now, by an interrupt */
-        outputs_off();
-}
-
 /* LED 0 leaves first and ends at the far end of the chain: it is output 15 of the last register. */
 static void load(const uint8_t *row)
 {
@@ -332,6 +328,17 @@ static void report_chip_fault(void)
 {
     failed = true;
     chips_stop();
+}
+
+static void outputs_on(void)
+{
+    if ((PWR_CSR & PVD_LOW) != 0u) { /* the PVD interrupts when the supply falls, not while it is low */
+        report_chip_fault();
+        return;
+    }
+    GPIO_BSRR(GPIOB) = PIN_CLEAR(0);
+    if (failed) /* just now, by an interrupt */
+        outputs_off();
 }
 
 /* Shift a row out by hand while no chips run: the single-LED test. False if SPI1 does not follow. */
@@ -894,7 +901,7 @@ int main(void)
     TIM_EGR(TIM2) = 1u;
     TIM_CR1(TIM2) = 1u;
     last_count = TIM_CNT(TIM2);
-    PWR_CR = PVD_2V8;
+    PWR_CR = PWR_SCALE_1 | PVD_2V8;
     EXTI_RTSR = EXTI_PVD; /* rising: the supply falls */
     evlcp_init(&board);
     if (by_watchdog)
