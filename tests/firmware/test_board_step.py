@@ -80,6 +80,12 @@ def test_a_pulse_that_comes_ends_the_wait():
     start_together([board], 10)
     wait_for_pulse([board], 2.0)
     assert board.status().state == State.PLAYING
+    board.blank()
+    device.bench.pulse_period = 1e7
+    device.run(2_000_000)
+    board.start(at_pulse=board.status().pulses + 300)  # farther away than half the range of the clock
+    device.run(1_000_000)
+    assert board.status().state == State.WAITING
 
 
 def test_what_cannot_be_is_refused():

@@ -808,7 +808,9 @@ static bool is_start_due(struct evlcp *e)
     if (e->start.at_pulse != 0u) {
         struct evlcp_pulse pulse;
         (void)hal_read_pulse(&pulse);
-        if (pulse.between == 0u)
+        /* Not while it is farther away than half the range of the clock. */
+        if (pulse.between == 0u ||
+            (int32_t)(e->start.at_pulse - pulse.count) > (int32_t)(INT32_MAX / pulse.between))
             return false;
         when.at = pulse.at + (e->start.at_pulse - pulse.count) * pulse.between;
         when.pulse = e->start.at_pulse;

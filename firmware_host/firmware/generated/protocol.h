@@ -293,7 +293,7 @@ struct EVLCP_PAYLOAD evlcp_commit_reply {
 struct EVLCP_PAYLOAD evlcp_start_request {
     uint32_t at_pulse; /* Begin at this pulse, as STATUS counts them, and keep in step; 0: not. */
     uint16_t pulse_hz; /* Pulses a second; must divide the chip rate. */
-    uint32_t at_clock; /* Without a pulse: begin when STATUS's clock stands here; 0: at once. */
+    uint32_t at_clock; /* Without a pulse: begin when STATUS's clock stands here, at most half its range ahead; 0: at once. */
 };
 
 /* Set the LED current; refused above its limit, or if what is committed were too bright. */

@@ -316,7 +316,7 @@ class StartRequest(WireRequest[EmptyReply]):
     #: Begin at this pulse, as STATUS counts them, and keep in step; 0: not.
     at_pulse: U32 = field(default=0, metadata={"since": 1})
     pulse_hz: U16 = field(default=0, metadata={"since": 1})  #: Pulses a second; must divide the chip rate.
-    #: Without a pulse: begin when STATUS's clock stands here; 0: at once.
+    #: Without a pulse: begin when STATUS's clock stands here, at most half its range ahead; 0: at once.
     at_clock: U32 = field(default=0, metadata={"since": 1})
 
 
