@@ -5,7 +5,6 @@ import hashlib
 import os
 import shutil
 import subprocess
-from functools import cache
 from pathlib import Path
 
 from firmware_host.errors import ToolchainError
@@ -14,7 +13,6 @@ FIRMWARE = Path(__file__).parent / "firmware"
 """The firmware's source tree."""
 
 
-@cache
 def build_folder() -> Path:
     """The folder for builds: `evlcp/firmware-HASH` in the user's cache."""
     digest = hashlib.sha256()
