@@ -585,6 +585,8 @@ def emulate(
     host.listening.check_listen_address(listen, pty=emulator == "native")
     if leds is not None:
         check_output(leds, regular=False)
+        if flash is not None and leds.resolve() == flash.resolve():
+            raise ConfigError(f"--leds and --flash: {leds} cannot be both; choose two files")
     with contextlib.ExitStack() as stack:
         if emulator == "native":
             board = stack.enter_context(contextlib.closing(host.native.NativeBoard(leds, flash, unique_id)))
@@ -666,13 +668,16 @@ def leds(
 
     For example: [bold]evlcp board leds leds.bin --chips chips.npy[/]
     """
+    ticks = chips.with_suffix(".ticks.npy")
+    if record.resolve() in (chips.resolve(), ticks.resolve()):
+        raise ConfigError(f"--chips {chips}: would overwrite the record {record}; choose another file")
     played = host.led_record.LedRecord.read(record).select_chips()
     clusters = None if per_led else sdk.resolve.load_link(link_file, overrides or []).bar.led_clusters()
     with name_place(f"{record}: ", InputError):
         table = played.chips(clusters)
     with Outputs() as outputs:
         outputs.write_array(table, chips)
-        outputs.write_array(played.ticks, chips.with_suffix(".ticks.npy"))
+        outputs.write_array(played.ticks, ticks)
     print_result(f"{len(played)} chips", {"chips": len(played), "cut_bytes": played.cut_bytes}, as_json)
     if played.cut_bytes:
         raise InputError(

@@ -188,6 +188,9 @@ def test_wrong_records_are_reported(evlcp, tmp_path):
     check_fault(cut, 3, "the last record is cut off (5 bytes)")
     assert cut.out == "2 chips\n"
     assert len(np.load(out)) == 2
+    check_fault(evlcp("board", "leds", torn, "--chips", torn), 2, f"would overwrite the record {torn}")
+    two = ("--leds", out, "--flash", out, "--listen", f"unix:{tmp_path / 'board'}")
+    check_fault(evlcp("board", "emulate", "native", *two), 2, f"{out} cannot be both")
 
 
 def test_a_record_that_is_written_is_the_one_that_is_read(tmp_path):
