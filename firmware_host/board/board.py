@@ -369,10 +369,7 @@ class Board:
             raise IncompatibleError(f"{self.session.name}: its firmware has no streams; update the firmware")
         self.check_fits(like)
         slots = (self.info.bank_bytes - len(like.table)) // like.packet_bytes
-        if ahead >= slots:
-            raise ConfigError(
-                f"ahead = {ahead}, {self.session.name} holds {slots - 1} packets of this length"
-            )
+        self._check_ahead(ahead, slots)
         status = self._wait_until_swapped()
         self._check_rate(like, status)
         if like.rest:
@@ -382,12 +379,21 @@ class Board:
         bank = 1 if status.active_bank == 0 else 0
         if like.content:
             self.write_missing(bank, like.content)
-        self.session.call(protocol.StreamRequest(bank, like.format, like.digest))
-        pulse_s = 0.5 if status.watchdog == Watchdog.KEEP else min(0.5, status.watchdog_ms / 3e3)
+        slots = self.session.call(protocol.StreamRequest(bank, like.format, like.digest)).slots
+        if ahead >= slots:
+            self.stop()
+        self._check_ahead(ahead, slots)
+        pulse_s = 0.5 if status.watchdog == Watchdog.KEEP else min(0.5, max(100, status.watchdog_ms) / 3e3)
         stream = Stream(self.session, bank, like, ahead, pulse_s)
         if status.state != State.PLAYING:
             self.start()
         return stream
+
+    def _check_ahead(self, ahead: int, slots: int) -> None:
+        if ahead >= slots:
+            raise ConfigError(
+                f"ahead = {ahead}, {self.session.name} holds {slots - 1} packets of this length"
+            )
 
     def _check_rate(self, content: Bank, status: protocol.StatusReply) -> None:
         rate_hz = content.chip_rate_hz * self._hold_count(content)
@@ -460,7 +466,7 @@ class Board:
                 f" alone: of {LEDS} LEDs in {CLUSTERS} equal clusters, codes of {WORD_CHIPS} chips, a"
                 f" preamble of at most {PREAMBLE_CHIPS}; update the firmware"
             )
-        room = info.bank_bytes - len(bank.table)
+        room = max(0, info.bank_bytes - len(bank.table))
         what = f"a bank of {name} has {info.bank_bytes}" + (
             f", {len(bank.table)} of them for the clusters" if len(bank.table) else ""
         )

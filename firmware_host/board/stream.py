@@ -32,6 +32,9 @@ DEFAULT_AHEAD = 4
 _PIECE_OVERHEAD = PushRequest.min_bytes()
 _DARK_S = 10.0
 
+_MOST_STANDS = 3
+"""Times in a row that the board may report that it plays the queue while neither end of it has moved."""
+
 
 class Stream:
     """A board's queue of packets; `Board.stream` makes one.
@@ -72,6 +75,7 @@ class Stream:
         self._pieces: list[PushRequest] = []
         self._in_flight: dict[int, PushRequest] = {}
         self._position = (0, 0)
+        self._stands = 0
         self.packet_s = template.link.packet.packet_chips / template.chip_rate_hz
         self._last_reply_s = session.transport.time_s()
         self._set_state_due()
@@ -87,6 +91,7 @@ class Stream:
             self._exchange(0.0)
             while self._pieces or self._in_flight:
                 self._exchange(self._pulse_s)
+                self._request_position()
 
     def __enter__(self) -> Self:
         return self
@@ -207,7 +212,9 @@ class Stream:
         if self._in_flight:
             return
         if now_s >= self._state_due_s:
-            self._check_state(self._session.call(StatusRequest()), State.FAULT, State.DARK)
+            status = self._session.call(StatusRequest())
+            self._check_state(status, State.FAULT, State.DARK)
+            self._check_progress(status)
             self._set_state_due()
         elif now_s - self._last_reply_s >= self._pulse_s:
             self._submit(PushRequest(self._bank, *self._position, 0, b""))
@@ -224,6 +231,17 @@ class Stream:
                 " see 'evlcp board status', then stream again",
                 Status.HARDWARE_FAULT,
                 status.faults,
+            )
+
+    def _check_progress(self, status: StatusReply) -> None:
+        """Raise RefusedError if the board plays the queue, but takes no piece, and begins no packet of it."""
+        plays = status.state in (State.PLAYING, State.IDLE_PATTERN) and status.active_bank == self._bank
+        self._stands = self._stands + 1 if plays and self._pieces else 0
+        if self._stands > _MOST_STANDS:
+            raise RefusedError(
+                f"{self._session.name}: plays, but takes no more packets of the stream ({self.begun} of"
+                f" {self._position[0]} have begun); 'evlcp board stop', then stream again",
+                Status.BUSY,
             )
 
     def _submit(self, request: PushRequest) -> None:
@@ -273,7 +291,10 @@ class Stream:
         request = self._in_flight.pop(outcome.token)
         reply = self._session.expect_reply(request, outcome)
         now_s = self._session.transport.time_s()
-        self._position = max(self._position, (reply.number, reply.offset))
+        position = max(self._position, (reply.number, reply.offset))
+        if (position, reply.begun) != (self._position, self.begun):
+            self._stands = 0
+        self._position = position
         if reply.begun > self.begun:
             # packets follow each other without a gap unless the queue was empty
             next_s = self._begun_s + (reply.begun - self.begun) * self.packet_s

@@ -1,6 +1,7 @@
 """Streams: every packet once and in order over any line, underruns named, dark at the end."""
 
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,11 +143,30 @@ def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_reported(device, board):
         stream.wait(2.0)
 
 
+def test_a_board_that_takes_no_packet_ends_the_stream(board, monkeypatch):
+    client = board.session.client
+    submit = client.submit
+
+    def with_another_number(request):
+        return submit(replace(request, number=99) if isinstance(request, protocol.PushRequest) else request)
+
+    stream = board.stream(LINK)
+    monkeypatch.setattr(client, "submit", with_another_number)
+    with pytest.raises(RefusedError, match="takes no more packets"):
+        stream.send(symbols_of(1)[0])
+
+
 def test_what_a_board_refuses(device, board):
     for ahead, wanted in ((1, "expected 2 or more"), (500, "holds 127 packets")):
         with pytest.raises(ConfigError, match=wanted):
             board.stream(LINK, ahead)
     assert board.status().active_bank == protocol.NO_BANK
+    # what it answers counts, not what HELLO lets expect
+    board.info = replace(info := board.info, bank_bytes=1 << 20)
+    with pytest.raises(ConfigError, match="holds 127 packets"):
+        board.stream(LINK, 200)
+    assert board.status().state == State.DARK
+    board.info = info
     huge = board_link("air.frames_per_packet=700")
     with pytest.raises(ConfigError, match=r"700 frames takes 22400 bytes.*room for two; .* 640 frames"):
         board.stream(huge)
