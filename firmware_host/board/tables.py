@@ -3,6 +3,7 @@
 from enum import Enum
 from typing import Any
 
+from evlcp_sdk.formatting import escape_controls
 from firmware_host.protocol.generated import requests as protocol
 from firmware_host.protocol.generated.requests import (
     NO_BANK,
@@ -20,7 +21,7 @@ def info_table(info: protocol.HelloReply) -> dict[str, Any]:
     # firmware that does not list its formats takes words and masks
     formats = info.formats or 1 << Format.WORDS | 1 << Format.MASKS
     return {
-        "hal": info.hal.rstrip(b"\0").decode("ascii", "replace"),
+        "hal": escape_controls(info.hal.rstrip(b"\0").decode("ascii", "replace")),
         "unique_id": info.unique_id.hex(),
         "firmware": f"{info.version_major}.{info.version_minor}.{info.version_patch}",
         "protocol": f"{info.major}.{info.minor}",
@@ -40,10 +41,7 @@ def _copy_fields(reply: protocol.HelloReply | protocol.StatusReply, *names: str)
 
 def enum_name(enum: type[Enum], value: int) -> str:
     """The name of a number of the protocol, or the number itself if this host does not know it."""
-    try:
-        return str(enum(value).name).lower()
-    except ValueError:
-        return str(value)
+    return next((member.name.lower() for member in enum if member.value == value), str(value))
 
 
 def flag_names(flags: type[Enum], value: int) -> list[str]:

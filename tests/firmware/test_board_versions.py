@@ -16,6 +16,7 @@ from board_lines import board_link, some_bank
 from firmware_host.board import session
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
+from firmware_host.board.tables import flag_names
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import IncompatibleError, RefusedError
 from firmware_host.ports.transport import ReplayTransport
@@ -99,6 +100,8 @@ def test_this_host_and_the_firmware_of_2_0(monkeypatch):
     answers = [0, 0, 0, 0, 40, (3, 40), 320, (0, 64, 0), (0, 1, b"native"), 200, 1]
     assert every_request(board, bank, bytes(range(200))) == answers
     assert not line._events
+    # a fault of a later firmware has a number
+    assert flag_names(requests.BoardFault, 1 | 1 << 15) == ["over_temperature", "bit 0x8000"]
 
 
 def test_the_host_of_2_0_and_this_firmware():
