@@ -231,8 +231,6 @@ extern uint32_t link_data_end[];
 extern uint32_t link_bss_start[];
 extern uint32_t link_bss_end[];
 
-void reset_handler(void); /* the linker script's entry */
-
 static struct evlcp board;
 static volatile uint16_t words[2][SLOTS_PER_CHIP]; /* two rows on their way to the chain */
 static uint32_t gone;                              /* the row that may be filled */
@@ -286,12 +284,6 @@ static void irq_enable(uint32_t irq, uint8_t priority)
     NVIC_ISER(irq / 32u) = 1u << irq % 32u;
 }
 
-static void irq_forget(uint32_t irq)
-{
-    NVIC_ICPR(irq / 32u) = 1u << irq % 32u;
-    __asm volatile("dsb\n isb" ::: "memory");
-}
-
 static void outputs_off(void)
 {
     GPIO_BSRR(GPIOB) = PIN(0);
@@ -320,7 +312,8 @@ static void chips_stop(void)
     }
     DMA_HIFCR = DMA_S5_FLAGS;
     SCB_ICSR = SYSTICK_FORGET;
-    irq_forget(IRQ_DMA2_STREAM5);
+    NVIC_ICPR(IRQ_DMA2_STREAM5 / 32u) = 1u << IRQ_DMA2_STREAM5 % 32u;
+    __asm volatile("dsb\n isb" ::: "memory");
     draining = 0u;
 }
 
@@ -926,7 +919,7 @@ int main(void)
     }
 }
 
-/* The first instruction after reset: copy initialised data, clear the rest, go. */
+/* The linker script's entry, the first instruction after reset: copy initialised data, clear the rest, go. */
 void reset_handler(void)
 {
     const uint32_t *from = link_data_load;
