@@ -127,14 +127,6 @@ class SimulatedLine(Transport):
         """Time of the board, s."""
         return self.board.now_us * 1e-6
 
-    def to_board(self, data: bytes) -> bytes:
-        """The bytes of `data` that arrive at the board; here all."""
-        return data
-
-    def to_host(self, data: bytes) -> bytes:
-        """The bytes of `data` that arrive at the host; here all."""
-        return data
-
     def read(self, timeout_s: float) -> bytes:
         """Bytes from the board; time passes until there are some, or `timeout_s` is over."""
         end = self.board.now_us + max(self.step_us, int(timeout_s * 1e6))
@@ -142,12 +134,12 @@ class SimulatedLine(Transport):
             self.board.run(self.step_us)
             data = self.board.take_output()
             if data:
-                return self.to_host(data)
+                return data
         return b""
 
     def write(self, data: bytes) -> None:
         """Bytes to the board."""
-        self.board.receive(self.to_board(data))
+        self.board.receive(data)
 
     def close(self) -> None:
         """Nothing to release."""

@@ -150,7 +150,7 @@ def recording(board):
 
 def deafen(line):
     """Let nothing arrive at the board from now on."""
-    line.to_board = lambda _: b""
+    line.write = lambda _: None
 
 
 class NoisyLine(SimulatedLine):
@@ -182,7 +182,12 @@ class NoisyLine(SimulatedLine):
             return out + out
         return out
 
-    to_board = to_host = spoil
+    def write(self, data):
+        super().write(self.spoil(data))
+
+    def read(self, timeout_s):
+        data = super().read(timeout_s)
+        return self.spoil(data) if data else data
 
 
 def packet_sequence(played, payloads):
