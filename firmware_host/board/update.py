@@ -191,13 +191,11 @@ def _restart_board(board: Board, wait_s: float) -> None:
         line.read(0.02)
     while True:
         try:
+            line.read(0.02)
             board.info = session.hello()
             if board.status().requests < requests:
                 return
+            raise VerifyError(f"{session.name}: has not been reset; run the command again")
         except BoardError:
             if line.time_s() > end:
                 raise
-            continue
-        if line.time_s() > end:
-            raise VerifyError(f"{session.name}: has not been reset; run the command again")
-        line.read(0.02)
