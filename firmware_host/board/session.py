@@ -277,21 +277,18 @@ class Session:
         """
         source = iter(requests)
         sent: dict[int, Request] = {}
-        has_more = True
         try:
-            while sent or has_more:
-                while has_more and self.client.has_room:
-                    request = next(source, None)
-                    if request is None:
-                        has_more = False
-                    else:
-                        self._check_supported(request)
-                        sent[self.client.submit(request)] = request
+            while True:
+                while self.client.has_room and (request := next(source, None)) is not None:
+                    self._check_supported(request)
+                    sent[self.client.submit(request)] = request
+                if not sent:
+                    return
                 data, deadline = self.client.poll(self.transport.time_s())
                 if data:
                     self.transport.write(data)
                 wait = 0.0 if deadline is None else max(0.0, deadline - self.transport.time_s())
-                received = self.transport.read(wait) if sent else b""
+                received = self.transport.read(wait)
                 for outcome in self.client.receive(received, self.transport.time_s()):
                     handle(sent.pop(outcome.token), outcome)
         finally:
