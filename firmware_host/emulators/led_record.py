@@ -39,9 +39,8 @@ class LedRecord:
     def of_records(cls, records: NDArray[np.void]) -> "LedRecord":
         """Convert an array of `RECORD`, whose tick counter wraps at 2**32."""
         tick = records["tick"].astype(np.uint32)
-        steps = np.diff(tick)  # modulo 2**32
-        start = tick[:1].astype(np.int64)
-        ticks = np.concatenate([start, start + np.cumsum(steps, dtype=np.int64)]) if len(tick) else start
+        steps = np.diff(tick, prepend=tick[:1])  # modulo 2**32
+        ticks = tick[:1].astype(np.int64) + np.cumsum(steps, dtype=np.int64)
         return cls(ticks, records["chip"].astype(np.uint32), np.ascontiguousarray(records["row"]))
 
     @classmethod
