@@ -32,9 +32,6 @@ DEFAULT_AHEAD = 4
 _PIECE_OVERHEAD = PushRequest.min_bytes()
 _DARK_S = 10.0
 
-_MOST_STANDS = 3
-"""Times in a row that the board may report that it plays the queue while neither end of it has moved."""
-
 
 class Stream:
     """A board's queue of packets; `Board.stream` makes one.
@@ -75,6 +72,7 @@ class Stream:
         self._pieces: list[PushRequest] = []
         self._in_flight: dict[int, PushRequest] = {}
         self._position = (0, 0)
+        self._last_ends: tuple[tuple[int, int], int] | None = None
         self._stands = 0
         self.packet_s = template.link.packet.packet_chips / template.chip_rate_hz
         self._last_reply_s = session.transport.time_s()
@@ -236,8 +234,10 @@ class Stream:
     def _check_progress(self, status: StatusReply) -> None:
         """Raise RefusedError if the board plays the queue, but takes no piece, and begins no packet of it."""
         plays = status.state in (State.PLAYING, State.IDLE_PATTERN) and status.active_bank == self._bank
-        self._stands = self._stands + 1 if plays and self._pieces else 0
-        if self._stands > _MOST_STANDS:
+        ends = (self._position, self.begun)
+        stands = plays and self._pieces and ends == self._last_ends
+        self._stands, self._last_ends = self._stands + 1 if stands else 0, ends
+        if self._stands == 3:  # one may have waited for a boundary, or for a piece
             raise RefusedError(
                 f"{self._session.name}: plays, but takes no more packets of the stream ({self.begun} of"
                 f" {self._position[0]} have begun); 'evlcp board stop', then stream again",
@@ -247,10 +247,6 @@ class Stream:
     def _submit(self, request: PushRequest) -> None:
         self._in_flight[self._session.client.submit(request)] = request
         self._submitted += 1
-
-    def _position_after(self, piece: PushRequest) -> tuple[int, int]:
-        end = piece.offset + len(piece.data)
-        return (piece.number + 1, 0) if end == self._template.packet_bytes else (piece.number, end)
 
     def _earliest_send_s(self, number: int, ahead: int) -> float:
         """Earliest time to send a packet so that at most `ahead` are on the board, s."""
@@ -291,10 +287,7 @@ class Stream:
         request = self._in_flight.pop(outcome.token)
         reply = self._session.expect_reply(request, outcome)
         now_s = self._session.transport.time_s()
-        position = max(self._position, (reply.number, reply.offset))
-        if (position, reply.begun) != (self._position, self.begun):
-            self._stands = 0
-        self._position = position
+        self._position = max(self._position, (reply.number, reply.offset))
         if reply.begun > self.begun:
             # packets follow each other without a gap unless the queue was empty
             next_s = self._begun_s + (reply.begun - self.begun) * self.packet_s
@@ -306,7 +299,7 @@ class Stream:
             self._begun_s = max(self._begun_s, now_s - self.packet_s)
         self.underruns = reply.underruns
         self._last_reply_s = now_s
-        if request.data and self._position_after(request) > self._position:
+        if request.data and (request.number, request.offset + len(request.data)) > self._position:
             # an earlier piece was lost, or there was no room
             insort(self._pieces, request, key=lambda piece: (piece.number, piece.offset))
             self._blocked_until_s = now_s + self.packet_s / 4.0
