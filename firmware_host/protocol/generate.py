@@ -51,11 +51,6 @@ def _expand_field(table: Table) -> Table:
 
 def _expand_message(table: Table) -> Table:
     parts = {part: [_expand_field(f) for f in table[part]] for part in ("request", "reply")}
-    for fields in parts.values():
-        if [f["since"] for f in fields] != sorted(f["since"] for f in fields):
-            raise ValueError(f"message {table['name']}: a field with `since` stands before one without")
-        if any(f["since"] and not f["size"] for f in fields):
-            raise ValueError(f"message {table['name']}: a field of any length cannot come later")
     request = parts["request"]
     return {
         "since": 0,
@@ -111,11 +106,7 @@ _TEMPLATES.filters |= {
 
 
 def render_template(template: str, definition: Table) -> str:
-    """A generated file: `requests.py`, `profiles.py`, `protocol.h`, `profiles.h` or `protocol.md`.
-
-    Raises:
-        ValueError: The definition contradicts itself.
-    """
+    """A generated file: `requests.py`, `profiles.py`, `protocol.h`, `profiles.h` or `protocol.md`."""
     messages = [_expand_message(table) for table in definition["message"]]
     return _TEMPLATES.get_template(f"{template}.j2").render(
         definition,
