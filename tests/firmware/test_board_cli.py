@@ -134,13 +134,11 @@ EMULATE = ("board", "emulate", "native")
         (("board", "leds", "no.bin", "--chips", "c.npy"), 3, "InputError", "no.bin"),
         (("board", "emulate", "stm32", "--listen", "pty"), 2, None, "expected unix:PATH, or tcp:HOST:PORT"),
         ((*EMULATE, "--listen", "smoke:signals"), 2, None, "from 1 to 65535, or pty"),
-        ((*EMULATE, "--listen", "tcp:127.0.0.1"), 2, None, "or tcp:HOST:PORT"),
         ((*EMULATE, "--listen", "unix:" + "x" * 200), 1, None, "AF_UNIX path too long"),
         (("tx", "frames", "--random", str(10**12)), 2, None, "at most 100000 frames in all"),
         (("tx", "message"), 2, "ConfigError", "give what to send: --text TEXT, --file FILE, --beacon"),
         (("board", "flash", "--port", "tcp:127.0.0.1:1"), 2, None, "give an image, or --target"),
         (("board", "flash", "--target", "stm32f405-8mhz"), 2, None, "--port: expected"),
-        (("board", "flash", "no.bin", "--port", "tcp:127.0.0.1:1"), 3, None, "no.bin"),
         (("loop", "--text", ""), 2, None, "text: expected at least one character"),
         (("loop", "--distance", "5"), 2, None, "the bar, 0.96 m high, fits into the image from 9.6 m on"),
         (("loop", "--set", "air.chip_rate_hz=12.5"), 2, None, "expected whole chips per second"),
@@ -228,7 +226,7 @@ def test_trace_and_replay(evlcp, tmp_path):
         check_fault(evlcp(*arguments, "--replay", trace), 3, f"{trace}: {message}")
 
 
-def test_line_options_stand_anywhere(evlcp, native, tmp_path, monkeypatch):
+def test_line_options_stand_anywhere(evlcp, native, monkeypatch):
     before = evlcp("board", "--port", native, "hello", "--json")
     behind = evlcp("board", "hello", "--json", "--port", native)
     assert json.loads(before.out)["unique_id"] == json.loads(behind.out)["unique_id"]
@@ -238,9 +236,6 @@ def test_line_options_stand_anywhere(evlcp, native, tmp_path, monkeypatch):
     well(evlcp("board", "--port", native, "hello"))
     monkeypatch.setenv("EVLCP_PORT", native)
     well(evlcp("board", "hello"))
-    trace = tmp_path / "wire.jsonl"
-    well(evlcp("board", "--port", native, "--trace", trace, "status"))
-    well(evlcp("board", "--replay", trace, "status"))
 
 
 def test_no_place_to_build_is_reported(tmp_path):
@@ -334,15 +329,12 @@ def test_a_flash_file_is_as_private_as_it_was(tmp_path):
         ("folder", "not a file"),
         ("notes.txt/flash.bin", "Not a directory"),
         ("notes.txt", "notes.txt: not a flash file of"),
-        ("long.bin", "long.bin: not a flash file of"),
     ],
 )
 def test_a_flash_file_that_cannot_be_used_is_left_alone(evlcp, tmp_path, name, message):
     (tmp_path / "folder").mkdir()
     (tmp_path / "notes.txt").write_text("mine")
-    (tmp_path / "long.bin").write_bytes(bytes(100_000))
     options = ("--listen", f"unix:{tmp_path / 'b'}", "--flash", tmp_path / name)
     check_fault(evlcp("board", "emulate", "native", *options), 3, message)
     check_fault(evlcp("board", "hello", "--port", f"native:{tmp_path / name}"), 3, message)
     assert (tmp_path / "notes.txt").read_text() == "mine"
-    assert (tmp_path / "long.bin").read_bytes() == bytes(100_000)

@@ -106,8 +106,6 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards, tmp_path):
     assert error["error"]["kind"] == "FleetError"
     file.write_text(file.read_text().replace("Tempo 30", "Tempo 50"))
     check_fault(evlcp("board", "verify", "--inventory", file), 7, "T0")
-    refused = evlcp("board", "status", "--inventory", file, "--port", "native:")
-    check_fault(refused, 2, "write --port there")
 
 
 @pytest.mark.parametrize(

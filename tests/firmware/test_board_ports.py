@@ -15,7 +15,7 @@ from board_lines import check_fault
 from evlcp_sdk.errors import ConfigError
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.ports.transport import SerialTransport, open_transport
-from firmware_host.ports.usb import find_usb_device, serial_ports, usb_filter
+from firmware_host.ports.usb import find_usb_device, usb_filter
 
 serial = pytest.importorskip("serial")
 Fault = serial.SerialException
@@ -61,30 +61,15 @@ def opened(monkeypatch):
     return names
 
 
-@pytest.mark.parametrize(
-    ("text", "takes"),
-    [
-        ("0403", ["COM7"]),
-        ("1546:01A9", ["COM9"]),
-        ("0403:6015:D30A1", ["COM7"]),
-        ("0403:6001", []),
-    ],
-)
-def test_ports_by_usb_id(ports, text, takes):
-    assert [p.device for p in filter(usb_filter(text), serial_ports())] == takes
-    if takes:
-        assert find_usb_device(text) == takes[0]
-    else:
-        with pytest.raises(NoBoardError, match="no serial port has this USB id"):
-            find_usb_device(text)
-
-
 def test_a_usb_id_must_be_one(ports, opened):
     for wrong in ("", "403", "0403-6015", "xyz0", "0403:"):
         with pytest.raises(ConfigError, match="expected VID, VID:PID or VID:PID:SERIAL"):
             usb_filter(wrong)
     with pytest.raises(NoBoardError, match="COM7: cannot be opened"):
         open_transport("usb:0403")
+    assert find_usb_device("1546:01A9") == "COM9"
+    with pytest.raises(NoBoardError, match="no serial port has this USB id"):
+        find_usb_device("0403:6001")
     ports.append(listed_port("COM8", 0x0403, 0x6015, "D30A2"))
     with pytest.raises(NoBoardError, match=r"2 ports have it: COM7 \(serial number D30A1\), COM8"):
         open_transport("usb:0403:6015")

@@ -1,6 +1,5 @@
 """Single requests to the firmware, and what it answers; `test_board_core` runs them under sanitizers, too."""
 
-import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -286,11 +285,3 @@ def test_slots_of_save(wire):
     assert wire.each(*tests) == [Status.OUT_OF_RANGE, Status.OUT_OF_RANGE, Status.OK]
     assert wire.each(SAVE, RECALL, STOP) == [Status.BUSY, Status.BUSY, Status.OK]
     assert not any(wire.device.bench.shown)
-    # a whole slot of the layout before pilot_every is empty to this firmware
-    header = bytearray(wire.device.read_flash()[:124])
-    header[:4] = (0x45564C31).to_bytes(4, "little")
-    old = bytes(header) + zlib.crc32(header).to_bytes(4, "little") + wire.device.read_flash()[128:]
-    wire.device.replace_flash(old)
-    wire.hello(2)
-    assert wire.ask(RECALL) == Status.EMPTY_SLOT
-    assert wire.status().active_bank == NO_BANK
