@@ -46,7 +46,8 @@ class FleetEntry(Settings):
         sequence: Number of its messages: raise it when they change.
         repeat: Times in a row that each packet is sent.
         link: The link, a file or its tables. Without it a payload's own, or all defaults.
-        unique_id: The part's unique id in hex, as `evlcp board hello` shows it; another board is refused.
+        unique_id: The part's unique id in hex, as `evlcp board hello` shows it, unique, too; another board is
+            refused.
         baud: Line rate, bit/s.
         board_key: File of the board's key.
 
@@ -120,11 +121,11 @@ def read_entries(path: Path) -> tuple[FleetEntry, ...]:
     for i, row in enumerate(tables.board):
         with name_place(f"{path}: board[{i}]: "):
             entries.append(build_spec(FleetEntry, tables.defaults | row))
-    for key in ("id", "port"):
-        first: dict[str, int] = {}
+    for key in ("id", "port", "unique_id"):
+        first: dict[str | None, int] = {}
         for i, entry in enumerate(entries):
             value = getattr(entry, key)
-            if value in first and not value.startswith("native:"):
+            if value is not None and value in first and not value.startswith("native:"):
                 raise ConfigError(
                     f"{path}: board[{i}]: {key} = {format_value(value)},"
                     f" expected another than board[{first[value]}]'s"

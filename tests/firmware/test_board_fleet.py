@@ -10,6 +10,7 @@ from firmware_host.board.fleet import read_inventory
 
 BOARD = '[[board]]\nid = "a"\nport = "native:"\nposition_m = [0, 0, 0]\n'
 GOOD = BOARD + "random = 1\n"
+ONLY = GOOD + f'unique_id = "{"0" * 24}"\n'
 
 
 @pytest.fixture
@@ -120,6 +121,7 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards, tmp_path):
         (GOOD + 'link = "no.toml"', 2, "no.toml: cannot be read"),
         (GOOD + "link = {air = {chip_rate_hz = 2e6}}", 2, "board[0]: the driver board cannot play this link"),
         (GOOD + GOOD, 2, 'board[1]: id = "a", expected another than board[0]\'s'),
+        (ONLY + ONLY.replace('"a"', '"b"'), 2, f'board[1]: unique_id = "{"0" * 24}", expected another'),
         (BOARD + 'payload = "no.json"', 3, "no.json: cannot be read"),
         (BOARD + 'text = "a"', 2, "a message needs sequence"),
         (GOOD + 'key = "k.pem"', 2, "key and user belong to a beacon"),
@@ -148,5 +150,5 @@ def test_another_board_on_the_port_is_refused(evlcp, tmp_path):
     done = evlcp("board", "monitor", "--inventory", file, "--interval", 0.05, "--count", 3)
     assert (done.code, done.out.count("b  ")) == (8, 3), "the other board is watched on"
     assert done.err.startswith("evlcp: a: native:: unique_id")
-    file.write_text(GOOD + f'unique_id = "{"0" * 24}"\n')
+    file.write_text(ONLY)
     well(evlcp("board", "program", "--inventory", file))
