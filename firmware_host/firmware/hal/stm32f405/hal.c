@@ -394,10 +394,10 @@ static void check_chip_progress(void)
         report_chip_fault();
 }
 
-/* Wait until the rows that the core has ended with have left the chain: at most three chips. */
+/* Wait until the rows that the core has ended with have left the chain: at most three chips, and none after a fault. */
 static void wait_until_drained(void)
 {
-    while (draining != 0u)
+    while (draining != 0u && streaming)
         check_chip_progress();
 }
 
