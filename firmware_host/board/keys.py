@@ -8,8 +8,6 @@ from evlcp_sdk.files import read_secret, write_secret
 from firmware_host.protocol.generated.requests import KEY_BYTES
 from firmware_host.protocol.seal import key_name
 
-_MAX_BYTES = 1024
-
 
 def make_board_key(path: Path) -> str:
     """Write a new key; return its name, 8 hex digits.
@@ -28,7 +26,7 @@ def read_board_key(path: Path) -> bytes:
     Raises:
         InputError: The file cannot be read, is accessible to others than its owner, or holds no key.
     """
-    text = read_secret(path, _MAX_BYTES)
+    text = read_secret(path, 1024)
     try:
         key = bytes.fromhex(text.decode("ascii").strip())
     except ValueError:

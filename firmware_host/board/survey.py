@@ -10,8 +10,6 @@ from firmware_host.ports.usb import BRIDGES, SerialPort, serial_ports, usb_filte
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import HelloReply
 
-_PROBE_TRIES = 2
-
 
 @dataclass(frozen=True)
 class SurveyedPort:
@@ -45,7 +43,7 @@ def survey_ports(
             return SurveyedPort(port, False, None, "no USB id of a board's bridge: not asked")
         try:
             line = open_transport(port.device, baud)
-            with Session(line, Timing(baud, latency_s=0.15), tries=_PROBE_TRIES) as session:
+            with Session(line, Timing(baud, latency_s=0.15), tries=2) as session:
                 return SurveyedPort(port, True, session.hello(), "")
         except BoardError as fault:
             return SurveyedPort(port, True, None, str(fault))
