@@ -58,7 +58,8 @@ class BarSpec:
     tilt_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans away from the camera.")] = 0.0
     ppm: Annotated[float, Field(ge=-1e5, le=1e5, description="How much faster its clock runs.")] = 0.0
     start_chip: Annotated[
-        float | None, Field(ge=0, description="Chip of a packet on air as the scene starts; none: random.")
+        float | None,
+        Field(ge=0, le=1e6, description="Chip of a packet on air as the scene starts; none: random."),
     ] = None
     transmitter_id: Annotated[
         int | None, Field(ge=0, lt=2**32, description="Its number as a site; none: 1 for the first bar.")
@@ -416,12 +417,10 @@ class Scene:
     def __post_init__(self) -> None:
         if len(self.bars) + len(self.lamps) + self.flicker_lamps > MAX_SOURCES:
             raise ConfigError(f"bars and lamps: expected at most {MAX_SOURCES} together")
-        for i, reflection in enumerate(self.reflections):
-            if reflection.bar is not None and reflection.bar >= len(self.bars):
-                some = format_count(len(self.bars), "bar")
-                raise ConfigError(
-                    f"reflections.{i}.bar = {reflection.bar}: expected one of {some}, from 0 on"
-                )
+        self._check_numbers()
+        rate = self.motion.pothole_rad_s
+        if rate not in (0.0, MotionSpec.pothole_rad_s) and not self.motion.pothole_s:
+            raise ConfigError(f"motion.pothole_rad_s = {rate}: expected pothole_s beside it")
         if self.lens.halo + self.lens.bloom >= 1:
             raise ConfigError(
                 f"lens.bloom = {self.lens.bloom}: expected less than 1 together with lens.halo ="
@@ -445,6 +444,23 @@ class Scene:
                     f"bars.{i}.z_m = {bar.z_m}: the bar is behind the camera, which starts"
                     f" {self.motion.distance_m} m before z_m = 0"
                 )
+
+    def _check_numbers(self) -> None:
+        """Check numbers of bars, and what sites need."""
+        chosen = [(f"reflections.{i}.bar", reflection.bar) for i, reflection in enumerate(self.reflections)]
+        chosen += [(f"bars.{i}.site_of", bar.site_of) for i, bar in enumerate(self.bars)]
+        for key, number in chosen:
+            if number is not None and number >= len(self.bars):
+                some = format_count(len(self.bars), "bar")
+                raise ConfigError(f"{key} = {number}: expected one of {some}, from 0 on")
+        first: dict[int, int] = {}
+        for i, bar in enumerate(self.bars):
+            if self.world is None and (bar.site_of is not None or any(bar.site_off_m)):
+                raise ConfigError(f"bars.{i}: site_of and site_off_m are of its site: expected a [world]")
+            number = i + 1 if bar.transmitter_id is None else bar.transmitter_id
+            if self.world is not None and first.setdefault(number, i) != i:
+                same = f"bars.{first[number]} has it, too; expected one each"
+                raise ConfigError(f"bars.{i}.transmitter_id = {number}: {same}")
 
 
 NEAREST_M = 0.5

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.formatting import format_count
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
@@ -83,16 +82,13 @@ def survey_sites(scene: Scene, seed: int, registry: Registry | None = None) -> t
     """Return the sites of the bars as a survey reports them, with its errors, known and unknown.
 
     Raises:
-        ConfigError: The scene has no `[world]`, a bar's link is not valid, or its `site_of` is no bar.
+        ConfigError: The scene has no `[world]`, or a bar's link is not valid.
     """
     world, axes = _require_world(scene)
     true = sites_of(scene, registry)
     errors = _make_rng(scene, seed, 0x517E).normal(size=(len(true), 3)) * world.survey_sigma_m
     surveyed = []
     for i, (bar, site) in enumerate(zip(scene.bars, true, strict=True)):
-        if bar.site_of is not None and bar.site_of >= len(true):
-            bars = format_count(len(true), "bar")
-            raise ConfigError(f"bars.{i}.site_of = {bar.site_of}: expected one of {bars}, from 0 on")
         there = true[i if bar.site_of is None else bar.site_of]
         off = np.array(bar.site_off_m) + errors[i]
         place: dict[str, Any] = {}

@@ -44,6 +44,8 @@ def test_examples_can_be_rendered(path: Path) -> None:
         ({"camera": {"width": 5000}}, "camera: expected at most 4096"),
         ({"bars": [{}] * 65}, "bars and lamps: expected at most 64"),
         ({"bars": [{"cover_s": [[0.1, 0.2, 3]]}]}, "bars.0.cover_s.0"),
+        ({"motion": {"pothole_rad_s": 2}}, "motion.pothole_rad_s = 2.0: expected pothole_s beside it"),
+        ({"bars": [{"start_chip": 1e12}]}, "bars.0.start_chip = 1000000000000.0: expected less than"),
         ({"reflections": [{"bar": 1}]}, "reflections.0.bar = 1: expected one of 1 bar, from 0 on"),
         ({"background": {"change_s": [[0, 1], [0, 9]]}}, "background.change_s = [0.0, 0.0]: expected times"),
         ({"wiper": {"edge_s": 0.02}}, "wiper.edge_s = 0.02: expected at most half of lasts_s"),

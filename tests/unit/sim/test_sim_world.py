@@ -1,7 +1,6 @@
 """Scenes on earth: bars as sites, the camera's path, against the image itself."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pymap3d
@@ -14,7 +13,6 @@ from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth
 from evlcp_sdk.sim.leds import split_into_strips
 from evlcp_sdk.sim.motion import CameraPath, project
 from evlcp_sdk.sim.world import attitude_log, scene_to_enu, survey_sites
-from evlcp_sdk.simulated import simulate
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 137.2, "height_m": 40.0, "heading_deg": 30.0}
 MOTION = {"distance_m": 50.0, "yaw_deg": 2.0, "pitch_deg": -1.0, "roll_deg": 4.0}
@@ -103,7 +101,7 @@ def test_what_an_imu_does_not_know(known: str) -> None:
         assert (log.heading_deg is None) == (known == "gravity")
 
 
-def test_what_is_stated_of_sites_is_wrong_as_declared(tmp_path: Path) -> None:
+def test_what_is_stated_of_sites_is_wrong_as_declared() -> None:
     assert survey_sites(SCENE, 5) == sites_of(SCENE)
     one, two, three = SCENE.bars
     swapped = (replace(one, site_of=1), replace(two, site_of=0, site_off_m=(0.3, -0.4, 1.2)), three)
@@ -114,11 +112,12 @@ def test_what_is_stated_of_sites_is_wrong_as_declared(tmp_path: Path) -> None:
     assert replace(reported[0], transmitter_id=77) == true[1]
     assert reported[2] == true[2]
     np.testing.assert_allclose(off_m(reported[1], true[0]), [0.3, -0.4, 1.2], atol=1e-5)
-    source = simulate(replace(wrong, bars=(one, two, replace(three, site_of=3))))
     with pytest.raises(ConfigError, match=r"bars\.2\.site_of = 3: expected one of 3 bars"):
-        source.save(tmp_path / "a.raw")
-    # Not after an hour of rendering.
-    assert not source.simulation.done_s
+        replace(wrong, bars=(one, two, replace(three, site_of=3)))
+    with pytest.raises(ConfigError, match=r"bars\.2\.transmitter_id = 77: bars\.1 has it, too"):
+        replace(wrong, bars=(one, two, replace(three, transmitter_id=77)))
+    with pytest.raises(ConfigError, match=r"bars\.0: site_of and site_off_m .* expected a \[world\]"):
+        replace(wrong, world=None)
 
 
 def off_m(said: BarSite, true: BarSite) -> tuple[float, float, float]:
