@@ -91,10 +91,10 @@ class TcpOutput(Server):
                 self._send(writer, (reports if watch["json"] else b"") + (nmea if watch["nmea"] else b""))
 
     def _send(self, writer: asyncio.StreamWriter, data: bytes) -> None:
-        """Send data to a client, unless too much waits for it."""
+        """Send data to a client, unless it has gone, or too much waits for it."""
         if writer.transport.get_write_buffer_size() > _MAX_UNSENT_BYTES:
             self._unsent += 1
-        else:
+        elif not writer.is_closing():
             writer.write(data)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

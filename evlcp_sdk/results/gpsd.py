@@ -73,7 +73,7 @@ def answer_request(
         return [device]
     if verb == "?POLL":
         reports = {name: [newest[name.upper()]] if name.upper() in newest else [] for name in ("tpv", "sky")}
-        return [{"class": "POLL", "active": 1, **reports}]
+        return [{"class": "POLL", "active": len(reports["tpv"]), **reports}]
     if verb != "?WATCH":
         return [{"class": "ERROR", "message": f"Unrecognized request '{request.strip()[:60]}'"}]
     try:
@@ -87,8 +87,6 @@ def answer_request(
         watch |= {name: bool(options[name]) for name in ("json", "nmea") if name in options}
         if options.get("raw"):
             watch["nmea"] = True
-        if watch["enable"] and not watch["nmea"]:
-            watch["json"] = True
     return [{"class": "DEVICES", "devices": [device]}, {"class": "WATCH", **watch}]
 
 

@@ -147,10 +147,10 @@ def _close_sentence(body: str) -> str:
 
 
 def _format_angle(degrees: float, digits: int, signs: str) -> str:
-    """Degrees and minutes to 1e-7 minutes, 0.2 mm."""
-    ticks = round(abs(degrees) * 60 * 1e7)
-    whole, minutes = divmod(ticks, 60 * 10**7)
-    return f"{whole:0{digits}d}{minutes // 10**7:02d}.{minutes % 10**7:07d},{signs[degrees < 0]}"
+    """Degrees and minutes to 1e-6 minutes, 2 mm; with another digit a GGA has more than 82 characters."""
+    ticks = round(abs(degrees) * 60 * 1e6)
+    whole, minutes = divmod(ticks, 60 * 10**6)
+    return f"{whole:0{digits}d}{minutes // 10**6:02d}.{minutes % 10**6:06d},{signs[degrees < 0]}"
 
 
 def format_clock(t_us: float, zero: datetime | None) -> Clock:
