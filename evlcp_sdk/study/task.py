@@ -71,7 +71,7 @@ def environment_of(registry: Registry) -> dict[str, Any]:
     import evlcp_sdk
 
     root = Path(evlcp_sdk.__file__).parent
-    files = {root / "values.py", root / "specs.py"} | {root / "study" / name for name in _STUDY}
+    files = {*root.glob("*.py")} | {root / "study" / name for name in _STUDY}
     files |= {path for name in _PACKAGES for path in (root / name).rglob("*.py")}
     for installed in registry.list_algorithms():
         if installed.distribution == "evlcp-sdk":
