@@ -162,14 +162,15 @@ def tally_positions(
     placed = navigator.feed(packets)
     rest, settled = navigator.close()
     placed += rest
-    axes, path, times = navigator.positioner.axes, truth.camera_path, truth.t_us
+    axes, times = navigator.positioner.axes, truth.t_us
+    assert axes is not None
+    # Longitudes cannot be interpolated at the 180th meridian.
+    path_m = axes.to_enu(*(truth.camera_path[key] for key in ("latitude_deg", "longitude_deg", "height_m")))
 
     def truth_at(t_us: float) -> tuple[int, np.ndarray]:
         elapsed_us = t_us - truth.t0_us
         segment = segment_of(min(float(np.interp(elapsed_us, times, bar.distance_m)) for bar in truth.bars))
-        keys = ("latitude_deg", "longitude_deg", "height_m")
-        assert axes is not None
-        return segment, axes.to_enu(*(np.interp(elapsed_us, times, path[key]) for key in keys))
+        return segment, np.array([np.interp(elapsed_us, times, column) for column in path_m.T])
 
     tallies = []
     for fix in (one.fix for one in placed):
