@@ -86,7 +86,9 @@ def bar_bound(
     >>> round(bar_bound(load_link(), 50.0, range(16), blur_px=0.45, noise=0.3), 4)
     0.0145
     """
-    _check_positive(distance_m=distance_m, blur_px=blur_px, noise=noise)
+    for name, quantity in (("distance_m", distance_m), ("blur_px", blur_px), ("noise", noise)):
+        if not quantity > 0:
+            raise ConfigError(f"{name} = {quantity}: expected a positive number")
     spacing_m = link.bar.column_pitch_m
     if not spacing_m > 0:
         raise ConfigError("this Cramer-Rao bound needs one even column of two clusters or more")
@@ -101,12 +103,6 @@ def bar_bound(
     slopes = slopes[:4, _select_rows(nearest, np.ones(clusters, np.bool_))]
     sigma_px = _first_sigma(columns / noise**2 * (slopes @ slopes.T))
     return float(distance_m * sigma_px / spacing)
-
-
-def _check_positive(**quantities: float) -> None:
-    for name, quantity in quantities.items():
-        if not quantity > 0:
-            raise ConfigError(f"{name} = {quantity}: expected a positive number")
 
 
 def _first_sigma(information: Array) -> float:
@@ -156,7 +152,8 @@ def frame_bound(link: Link, *, full_events: float = 3.0) -> Callable[[FrameView]
 
 def _compute_frame_bound(link: Link, full_events: float, view: FrameView) -> Range:
     seen, middles = _find_middles(view.presence)
-    if int((seen[1:] & seen[:-1]).sum()) < _MIN_BOUNDARIES:
+    pairs = int((seen[1:] & seen[:-1]).sum())
+    if pairs < _MIN_BOUNDARIES:
         return NO_RANGE
     width, height = np.ptp(middles[seen], axis=0)
     is_upright = bool(height >= width)
@@ -193,7 +190,6 @@ def _compute_frame_bound(link: Link, full_events: float, view: FrameView) -> Ran
         gain=float(fit[3]),
         shift_px=float(fit[1]),
     )
-    pairs = int((seen[1:] & seen[:-1]).sum())
     return Range(distance_m, sigma_m, pairs) if math.isfinite(sigma_m) else NO_RANGE
 
 
