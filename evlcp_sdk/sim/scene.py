@@ -418,9 +418,10 @@ class Scene:
         if len(self.bars) + len(self.lamps) + self.flicker_lamps > MAX_SOURCES:
             raise ConfigError(f"bars and lamps: expected at most {MAX_SOURCES} together")
         self._check_numbers()
-        rate = self.motion.pothole_rad_s
-        if rate not in (0.0, MotionSpec.pothole_rad_s) and not self.motion.pothole_s:
-            raise ConfigError(f"motion.pothole_rad_s = {rate}: expected pothole_s beside it")
+        if self.motion.pothole_rad_s not in (0.0, MotionSpec.pothole_rad_s) and not self.motion.pothole_s:
+            raise ConfigError(
+                f"motion.pothole_rad_s = {self.motion.pothole_rad_s}: expected pothole_s beside it"
+            )
         if self.lens.halo + self.lens.bloom >= 1:
             raise ConfigError(
                 f"lens.bloom = {self.lens.bloom}: expected less than 1 together with lens.halo ="
@@ -451,16 +452,15 @@ class Scene:
         chosen += [(f"bars.{i}.site_of", bar.site_of) for i, bar in enumerate(self.bars)]
         for key, number in chosen:
             if number is not None and number >= len(self.bars):
-                some = format_count(len(self.bars), "bar")
-                raise ConfigError(f"{key} = {number}: expected one of {some}, from 0 on")
-        first: dict[int, int] = {}
+                raise ConfigError(
+                    f"{key} = {number}: expected one of {format_count(len(self.bars), 'bar')}, from 0 on"
+                )
         for i, bar in enumerate(self.bars):
             if self.world is None and (bar.site_of is not None or any(bar.site_off_m)):
                 raise ConfigError(f"bars.{i}: site_of and site_off_m are of its site: expected a [world]")
-            number = i + 1 if bar.transmitter_id is None else bar.transmitter_id
-            if self.world is not None and first.setdefault(number, i) != i:
-                same = f"bars.{first[number]} has it, too; expected one each"
-                raise ConfigError(f"bars.{i}.transmitter_id = {number}: {same}")
+        ids = [i + 1 if bar.transmitter_id is None else bar.transmitter_id for i, bar in enumerate(self.bars)]
+        if self.world is not None and len(set(ids)) < len(ids):
+            raise ConfigError(f"bars.transmitter_id = {ids}: expected another one of each bar")
 
 
 NEAREST_M = 0.5

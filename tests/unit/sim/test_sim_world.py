@@ -114,7 +114,7 @@ def test_what_is_stated_of_sites_is_wrong_as_declared() -> None:
     np.testing.assert_allclose(off_m(reported[1], true[0]), [0.3, -0.4, 1.2], atol=1e-5)
     with pytest.raises(ConfigError, match=r"bars\.2\.site_of = 3: expected one of 3 bars"):
         replace(wrong, bars=(one, two, replace(three, site_of=3)))
-    with pytest.raises(ConfigError, match=r"bars\.2\.transmitter_id = 77: bars\.1 has it, too"):
+    with pytest.raises(ConfigError, match=r"bars\.transmitter_id = \[1, 77, 77\]: expected"):
         replace(wrong, bars=(one, two, replace(three, transmitter_id=77)))
     with pytest.raises(ConfigError, match=r"bars\.0: site_of and site_off_m .* expected a \[world\]"):
         replace(wrong, world=None)
