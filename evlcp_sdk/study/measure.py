@@ -127,14 +127,9 @@ def tally_messages(packets: Iterable[Packet], truth: Truth, coder: BlockCoder) -
     return tallies
 
 
-def number_sites(
-    packets: Sequence[Packet], truth: Truth, sites: Sequence[BarSite] | None = None
-) -> list[BarSite]:
-    """Sites of a truth's bars, each with the number of the transmitter that the receiver sees there.
-
-    `sites` are the surveyed ones, in the bars' order; None for the truth.
-    """
-    numbered = list(truth.sites if sites is None else sites)
+def number_sites(packets: Sequence[Packet], truth: Truth, sites: Sequence[BarSite]) -> list[BarSite]:
+    """Sites of a truth's bars, in their order, each with the number of the transmitter that is seen there."""
+    numbered = list(sites)
     first: dict[int, Frame] = {}
     for packet in packets:
         for frame in packet.frames:
@@ -152,7 +147,7 @@ def tally_positions(
     truth: Truth,
     link: Link,
     attitude: AttitudeLog | None,
-    sites: Sequence[BarSite] | None = None,
+    sites: Sequence[BarSite],
 ) -> list[tuple[int, Tally]]:
     """Tally positions and track against the truth, each with the start of the nearest bar's segment.
 

@@ -301,7 +301,7 @@ def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
     log = attitude_log(exact, 0, simulation.path)
     if log is not None:
         log = replace(log, heading_sigma_deg=np.full(len(log.t_us), WorldSpec().heading_sigma_deg))
-    tallies = tally_positions(packets, truth, load_link(), log)
+    tallies = tally_positions(packets, truth, load_link(), log, truth.sites)
     total = Tally.sum(tally for _, tally in tallies)
     assert {begin for begin, _ in tallies} == {40}
     if attitude == "none":
@@ -316,7 +316,7 @@ def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
     # A truth 1e-4 degrees further north is 11.1 m off.
     path = truth.camera_path
     moved = replace(truth, camera_path={**path, "latitude_deg": path["latitude_deg"] + 1e-4})
-    total = Tally.sum(tally for _, tally in tally_positions(packets, moved, load_link(), log))
+    total = Tally.sum(tally for _, tally in tally_positions(packets, moved, load_link(), log, moved.sites))
     assert total.position_rmse_m == pytest.approx(11.1, abs=0.1)
     assert total.position_nees > 20
     assert total.track_rmse_m == pytest.approx(11.1, abs=0.1)
