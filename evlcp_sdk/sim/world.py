@@ -148,14 +148,13 @@ def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeLog | Non
         return None
     t_us = np.append(np.arange(0.0, scene.duration_s * 1e6, 1000.0), scene.duration_s * 1e6)
     yaw, pitch, roll = np.degrees(path.sample(np.maximum(t_us - world.attitude_late_ms * 1e3, 0.0))[1]).T
-    error = _make_rng(scene, seed, 0xA77).normal(size=3) * world.attitude_errs
-    off = np.array(world.attitude_off_deg)
-    heading = world.heading_deg + yaw + error[2] * world.heading_sigma_deg + off[2]
+    sigmas = np.array([world.gravity_sigma_deg, world.gravity_sigma_deg, world.heading_sigma_deg])
+    off = _make_rng(scene, seed, 0xA77).normal(size=3) * world.attitude_errs * sigmas + world.attitude_off_deg
     return AttitudeLog(
         t_us + scene.t0_us,
-        pitch + error[0] * world.gravity_sigma_deg + off[0],
-        roll + error[1] * world.gravity_sigma_deg + off[1],
-        heading if world.attitude == "heading" else None,
+        pitch + off[0],
+        roll + off[1],
+        world.heading_deg + yaw + off[2] if world.attitude == "heading" else None,
         np.full(len(t_us), world.gravity_sigma_deg),
         np.full(len(t_us), world.heading_sigma_deg),
     )
