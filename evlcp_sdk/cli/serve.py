@@ -38,14 +38,13 @@ def serve(
         stop_on_request() as stopped,
         sdk.interruptible.open_until_stopped(url, sdk.registry.Registry.load(), stopped) as opened,
     ):
-        recorded = not opened.live or isinstance(opened, sdk.replay.ReplaySource)
         source = opened if opened.live else sdk.replay.ReplaySource(opened)
         with sdk.sender.Sender(source, address, unix) as sender:
             if address is not None:
                 print_stderr(f"sending {url} to whoever connects to tcp://{address[0]}:{sender.port}")
             if unix is not None:
                 print_stderr(f"sending {url} to whoever connects to unix:{unix}")
-            if recorded and not sender.wait(stopped):
+            if isinstance(source, sdk.replay.ReplaySource) and not sender.wait(stopped):
                 return
             try:
                 sender.run(stopped)

@@ -86,10 +86,8 @@ class Reader:
     def take(self, timeout_s: float) -> Slice | None:
         """Remove and return the next slice; None after the time-out, or at the end."""
         with self._changed:
-            if (
-                not self._changed.wait_for(lambda: self._waiting or self._finished, timeout_s)
-                or not self._waiting
-            ):
+            self._changed.wait_for(lambda: self._waiting or self._finished, timeout_s)
+            if not self._waiting:
                 return None
             piece = self._waiting.popleft()
             self._events -= len(piece.events)

@@ -21,9 +21,8 @@ def load_kernels(links: Sequence[Link], *, positions: bool = False) -> None:
     """Load a receiver's kernels by frames of drawn bars and a piece of the recording that comes with the SDK,
     and what positions need of SciPy, which loads slowly.
     """
-    for link in links:
-        if has_bar_frames(link):
-            load_decoder_kernels(link)
+    for link in filter(has_bar_frames, links):
+        load_decoder_kernels(link)
     if positions:
         chi_square(0.5, 1)
     receiver, pictures, camera = Receiver(links), PictureSlot(), links[0].camera

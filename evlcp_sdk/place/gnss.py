@@ -175,7 +175,7 @@ _SIGMA_M = (1e-4, 1e4)
 """Range of a sigma: with 0 nothing else would count, and 10 km is no information."""
 _COVARIANCES = {"cov_east_north_m2": (0, 1), "cov_east_up_m2": (0, 2), "cov_north_up_m2": (1, 2)}
 
-_LEVEL_SIGMA_RAD = math.radians(10.0)
+_LEVEL_SIGMA_DEG = 10.0
 """Sigma of unmeasured pitch and roll, for the antenna's place."""
 
 
@@ -288,5 +288,5 @@ def add_heading(known: Attitude | None, heading: tuple[float, float] | None) -> 
     """
     if heading is None or (known is not None and known.heading_deg is not None):
         return known
-    level = Attitude(gravity_sigma_deg=math.degrees(_LEVEL_SIGMA_RAD)) if known is None else known
+    level = Attitude(gravity_sigma_deg=_LEVEL_SIGMA_DEG) if known is None else known
     return Attitude(level.pitch_deg, level.roll_deg, heading[0] % 360, level.gravity_sigma_deg, heading[1])

@@ -128,8 +128,10 @@ def gbs(clock: Clock, undetected_m: NDArray[np.float64], failed: FailedBar | Non
     east, north, up = (f"{m:.3f}" if math.isfinite(m) else "" for m in undetected_m.tolist())
     bar = ",,,"
     if failed is not None:
-        bar = f"{failed.transmitter:02d},{failed.missed_probability:.4f}"
-        bar += f",{failed.bias_m:.3f},{failed.sigma_m:.3f}"
+        bar = (
+            f"{failed.transmitter:02d},{failed.missed_probability:.4f}"
+            f",{failed.bias_m:.3f},{failed.sigma_m:.3f}"
+        )
     return _close_sentence(f"INGBS,{clock[0]},{north},{east},{up},{bar}")
 
 

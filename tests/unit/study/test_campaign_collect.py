@@ -87,19 +87,13 @@ def test_a_job_that_fails_does_not_stop_the_others(tmp_path: Path, executor: Exe
     assert [t.tasks for t in totals] == [4, 4, 0, 0, 4, 4, 0, 0, 4, 4]
 
 
-def test_a_worker_that_dies_is_replaced(tmp_path: Path) -> None:
-    plan = fake_plan(seeds=1, dies_once=str(tmp_path / "mark"))
+def test_a_worker_that_dies_is_replaced_and_a_job_that_kills_them_given_up(tmp_path: Path) -> None:
+    plan = fake_plan(scenes=3, seeds=1, dies=1, dies_once=str(tmp_path / "mark"))
     progress, totals = collect_plan(plan, tmp_path / "a.sqlite", Processes(2))
-    assert not progress.faults
-    assert totals == collect_plan(fake_plan(seeds=1), tmp_path / "b.sqlite")[1]
-
-
-def test_a_job_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
-    progress, _ = collect_plan(fake_plan(scenes=3, seeds=1, dies=1), tmp_path / "a.sqlite", Processes(2))
     ((job, fault),) = progress.faults
-    assert job.scene["n"] == 1
-    assert fault.message == "its process died 3 times"
-    assert progress.done == 4
+    assert (job.scene["n"], fault.message) == (1, "its process died 3 times")
+    expected = collect_plan(fake_plan(scenes=3, seeds=1), tmp_path / "b.sqlite")[1]
+    assert totals == [*expected[:2], Statistics(), Statistics(), *expected[4:]]
 
 
 def begin(store: Path) -> subprocess.Popen[bytes]:
