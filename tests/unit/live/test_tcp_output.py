@@ -14,6 +14,7 @@ from evlcp_sdk.cli.live import ServingOptions, _serve
 from evlcp_sdk.errors import InterruptedRunError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.live import News, Publisher
+from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.server import Server, serve
 from evlcp_sdk.live.tcp_output import TcpOutput
 from tests.unit.live.helpers import dies, publish_fix
@@ -81,15 +82,21 @@ def test_a_client_that_stalls_or_leaves_costs_nothing(served: tuple[Publisher, d
         assert got == b"$INTXT"
 
 
-def test_the_command_reports_what_slow_clients_missed(monkeypatch, capsys) -> None:
+def test_the_command_reports_what_slow_clients_and_a_full_disk_missed(monkeypatch, capsys) -> None:
     monkeypatch.setattr(TcpOutput, "dropped", 3)
-    serving = _serve(ServingOptions(nmea_port=0), Publisher(), [load_link()], "a.raw", None, None, None)
+    monkeypatch.setattr(Recorder, "state", {"fault": "no room", "file": "live.raw", "dropped": 2})
+    options = ServingOptions(nmea_port=0, view_record=True)
+    serving = _serve(options, Publisher(), [load_link()], "a.raw", None, None, None)
     with suppress(InterruptedRunError), serving:
         served = capsys.readouterr().err
         raise InterruptedRunError
     assert served.startswith("evlcp: NMEA at ")
     url = served.split()[-1]
-    assert capsys.readouterr().err == f"evlcp: {url}: 3 results were not sent, as clients were too slow\n"
+    assert capsys.readouterr().err.splitlines() == [
+        f"evlcp: {url}: 3 results were not sent, as clients were too slow",
+        "evlcp: the recording ended: no room",
+        "evlcp: live.raw: 2 pieces are missing: the disk was too slow",
+    ]
 
 
 def test_gpsd_talks_once_it_is_asked(served: tuple[Publisher, dict[str, Server]]) -> None:

@@ -86,7 +86,6 @@ def test_an_id_follows_everything_that_determines_the_result_and_nothing_else(tm
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("seeds = 3", "seeds = 0", "c.toml: campaign.seeds = 0: expected greater than or equal to 1"),
         ("[20, 30]", "20", "c.toml: scene.grid.speed_kmh = 20: expected a list of values"),
         ("[20, 30]", "[20, 20]", "c.toml: scene.grid.speed_kmh: a value stands there twice"),
         ("speed_kmh", "wrong", "c.toml: scene: wrong: unknown key"),
