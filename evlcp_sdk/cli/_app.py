@@ -104,22 +104,25 @@ def make_app(*modules: str) -> typer.Typer:
     return app
 
 
-def add_plugin_commands(app: typer.Typer, registry: "sdk.registry.Registry") -> None:
-    """Add the commands of plugins; a plugin whose commands cannot be built, or exist already, is left out."""
-    known = _command_names(app)
+def add_plugin_commands(app: typer.Typer, registry: "sdk.registry.Registry") -> dict[str, str]:
+    """Add the commands of plugins; return the plugin of each that is not the SDK's own.
+
+    A plugin whose commands cannot be built, or exist already, is left out.
+    """
+    known, strangers = _command_names(app), dict[str, str]()
     for plugin in registry.plugins_with_hook("evlcp_register_commands"):
         added = typer.Typer()
         for _ in registry.call_hook("evlcp_register_commands", only=plugin, app=added):
-            reason = None
             if registry.distribution_of(plugin)[0] != "evlcp-sdk":
                 # The SDK's own are tested.
-                reason = _find_fault(added, known)
-            if reason is not None:
-                registry.leave_out(plugin, reason)
-                continue
+                if (reason := _find_fault(added, known)) is not None:
+                    registry.leave_out(plugin, reason)
+                    continue
+                strangers |= dict.fromkeys(_command_names(added), plugin)
             known |= _command_names(added)
             app.registered_commands += added.registered_commands
             app.registered_groups += added.registered_groups
+    return strangers
 
 
 def _command_names(app: typer.Typer) -> set[str]:
@@ -170,7 +173,7 @@ def run() -> None:
     import warnings
 
     from evlcp_sdk.cli._stderr import print_stderr
-    from evlcp_sdk.errors import PluginWarning
+    from evlcp_sdk.errors import OWN_FAULT, PluginError, PluginWarning, describe_plugin_fault, explain_fault
 
     show_other = warnings.showwarning
     # Every registry of the process repeats it; Python's own filter forgets when a library changes it.
@@ -186,13 +189,20 @@ def run() -> None:
         warnings.simplefilter("always", PluginWarning)
         warnings.showwarning = show
         silence_matplotlib()
-        module = "".join(sys.argv[1:2]).replace("-", "_")
+        name = "".join(sys.argv[1:2])
+        module, registry, strangers = name.replace("-", "_"), None, dict[str, str]()
         if module in _BUILT_IN and module != "plugins":
             # Neither other commands nor plugins are needed, which take a tenth of a start.
             app = make_app(module)
         else:
-            app = make_app()
-            add_plugin_commands(app, sdk.registry.Registry.load())
+            app, registry = make_app(), sdk.registry.Registry.load()
+            strangers = add_plugin_commands(app, registry)
         group = typer.main.get_group(app)
         _prepare_command(group)
-        group()
+        try:
+            group(obj=registry)
+        except Exception as fault:
+            if name not in strangers or explain_fault(fault)[1] != OWN_FAULT:
+                raise
+            blamed = f"command '{name}' of plugin {strangers[name]}: {describe_plugin_fault(fault)}"
+            raise PluginError(blamed) from fault

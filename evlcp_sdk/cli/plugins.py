@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
+import typer
+
 from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, print_result
 from evlcp_sdk.errors import PluginError
 
 
-def plugins(as_json: Json = False) -> None:
+def plugins(ctx: typer.Context, as_json: Json = False) -> None:
     """List the roles, the algorithms installed, and broken plugins.
 
     `*` marks the default of a role, `!` two algorithms of one id, of which none can be used. Select an
@@ -19,7 +21,8 @@ def plugins(as_json: Json = False) -> None:
 
     Exit code 0, also when plugins are broken and left out.
     """
-    table = tabulate_plugins(sdk.registry.Registry.load())
+    # The registry of the command line, which knows whose commands are broken.
+    table = tabulate_plugins(ctx.obj)
     print_result(_format_table(table), table, as_json, 2)
 
 

@@ -60,6 +60,9 @@ class BrokenPlugin:
         return f"plugin {self.plugin}{owner} is broken and left out: {self.reason}"
 
 
+_HOOKS = {name for name in vars(hookspecs) if name.startswith("evlcp_")}
+
+
 @lru_cache(maxsize=1)
 def _find_entry_points(
     find: Callable[..., Iterable[EntryPoint]], folders: tuple[str, ...]
@@ -84,7 +87,7 @@ class Registry:
         plugins: Objects with hooks, e.g. a probe.
 
     Raises:
-        PluginError: Such an object has an unknown hook.
+        PluginError: Such an object has no hook, or an unknown one.
     """
 
     def __init__(self, *plugins: object) -> None:
@@ -95,6 +98,8 @@ class Registry:
         self._collected: dict[tuple[str, str], list[InstalledAlgorithm]] | None = None
         for plugin in plugins:
             self._add_plugin(plugin)
+            if not self._manager.get_hookcallers(plugin):
+                raise PluginError(f"plugin {plugin!r}: expected an object with a method marked @hookimpl")
 
     @classmethod
     def load(cls, *plugins: object) -> "Registry":
@@ -103,7 +108,7 @@ class Registry:
         Installed packages are read once in a process, and again when `sys.path` has changed.
 
         Raises:
-            PluginError: Such an object has an unknown hook.
+            PluginError: Such an object has no hook, or an unknown one.
         """
         registry = cls(*plugins)
         for entry in _find_entry_points(entry_points, tuple(sys.path)):
@@ -274,10 +279,14 @@ class Registry:
             return " ".join(str(fault.args[0]).split())
         except ValueError:
             return "it is registered twice"
-        for hook in self._manager.get_hookcallers(plugin) or []:
-            if not hook.has_spec():
-                self._manager.unregister(name=name)
-                return f"has the hook '{hook.name}', which this SDK does not have"
+        hooks = {hook.name for hook in self._manager.get_hookcallers(plugin) or ()}
+        unknown = [f"has the hook '{hook}', which this SDK does not have" for hook in sorted(hooks - _HOOKS)]
+        unmarked = [
+            f"{hook} is not marked with @hookimpl" for hook in _HOOKS - hooks if hasattr(plugin, hook)
+        ]
+        if faults := unknown + unmarked:
+            self._manager.unregister(name=name)
+            return faults[0]
         return None
 
     def _record_broken(self, name: str, reason: str, algorithms: frozenset[tuple[str, str]]) -> None:

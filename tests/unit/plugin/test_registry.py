@@ -112,6 +112,10 @@ BROKEN: dict[str, tuple[Callable[[], object], str]] = {
         lambda: plugin(evlcp_algorithms=brings_mine, evlcp_algoritms=lambda: None),
         "has the hook 'evlcp_algoritms', which this SDK does not have",
     ),
+    "unmarked": (
+        lambda: SimpleNamespace(evlcp_algorithms=list),
+        "evlcp_algorithms is not marked with",
+    ),
     "arguments": (
         lambda: plugin(evlcp_algorithms=brings_mine, evlcp_stage_finished=lambda stage, nothing: None),
         "nothing",
@@ -148,6 +152,8 @@ def test_a_plugin_that_fails_when_asked_is_left_out_from_then_on() -> None:
     with pytest.warns(PluginWarning, match=r"plugin \S+ is .*: evlcp_open_events\(\) fails: KeyError"):
         answers = registry.call_hook("evlcp_open_events", url="cam:0")
     assert [answer for _, answer in answers] == ["source of cam:0"]
+    with pytest.raises(PluginError, match=r"^plugin 'my_cam': expected an object with a method marked"):
+        Registry("my_cam")
     assert registry.plugins_with_hook("evlcp_stage_finished") == []
     assert registry.call_hook("evlcp_open_events", url="cam:0") == answers
 
@@ -189,6 +195,7 @@ def test_the_command_line_goes_on_without_a_broken_plugin(stranger, reason, monk
         assert done.code == 0
         assert done.err.startswith(message)
         assert done.err.count("\n") == 1
+    assert f"\nbroken: plugin stranger of evlcp-stranger 1.0: {reason}" in done.out
     assert "mine" not in evlcp("--help").out
     asked = evlcp("config", "--set", "ranging.id=mine")
     assert asked.code == 2
@@ -196,6 +203,18 @@ def test_the_command_line_goes_on_without_a_broken_plugin(stranger, reason, monk
     assert "no ranging algorithm named 'mine'" in fault
     # A plugin whose commands alone are broken still brings its algorithms.
     assert ("is broken and left out" in fault) == (stranger is missing)
+
+
+def test_a_strangers_command_that_raises_is_no_fault_of_evlcp(monkeypatch, evlcp) -> None:
+    def boom(number: int) -> None:
+        raise KeyError(number)
+
+    install(monkeypatch, ("stranger", "evlcp-stranger", lambda: adding(boom)()), beside=True)
+    done = evlcp("boom", "3")
+    assert (done.code, done.out) == (2, "")
+    assert done.err.startswith(
+        "evlcp: command 'boom' of plugin stranger: KeyError: 3 (test_registry.py, line"
+    )
 
 
 def test_broken_and_conflicting_plugins_are_listed(monkeypatch: pytest.MonkeyPatch, evlcp: Any) -> None:
