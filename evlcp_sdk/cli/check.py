@@ -11,10 +11,10 @@ from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._common import Json, LinkFile, console, print_result
 from evlcp_sdk.errors import ConfigError
 
-_STYLES = {"ok": "green", "failed": "bold red", "skipped": "dim", "excused": "yellow"}
-
 _WIDTH = 18
-"""Of a law's name, where outcomes are printed as they come: the longest is `codewords-distinct`."""
+"""Of a law's name: the longest is `codewords-distinct`."""
+
+_STYLES = {"ok": "green", "failed": "bold red", "skipped": "dim", "excused": "yellow"}
 
 
 def check(
@@ -79,11 +79,9 @@ def _check_link(
     laws: list[dict[str, str | None]] = []
     for role, outcome in sdk.suite.check_link(link):
         id = ids.get(role)
-        if not as_json:
-            if not laws or laws[-1]["role"] != role:
-                console().print("the link" if id is None else f"{role} '{id}'", style="bold")
-            _print_outcomes([outcome], _WIDTH)
-        laws.append({"role": role, "id": id, **_describe_outcome(outcome)})
+        if not as_json and (not laws or laws[-1]["role"] != role):
+            console().print("the link" if id is None else f"{role} '{id}'", style="bold")
+        laws.append({"role": role, "id": id, **_report_outcome(outcome, as_json)})
     return link_file or "the default link", {"link": link.digest, "laws": laws}
 
 
@@ -96,7 +94,7 @@ def _check_algorithm(
     *,
     as_json: bool,
 ) -> tuple[str, dict[str, Any]]:
-    """Check an algorithm against the laws of its role; return its name and the JSON table."""
+    """Check an algorithm against the laws of its role, likewise."""
     sdk.testing.laws_of(role)
     registry = sdk.registry.Registry.load()
     entry = registry.find(role, id)
@@ -107,9 +105,7 @@ def _check_algorithm(
             raise ConfigError(f"--excuse {text}: expected LAW=REASON")
         reasons[law.strip()] = reason.strip()
     link = _build_link(role, id, link_file, overrides, registry)
-    outcomes = sdk.testing.check(role, link.algorithm(role), reasons, link)
-    if not as_json:
-        _print_outcomes(outcomes, max(len(o.law.name) for o in outcomes))
+    outcomes = sdk.suite.check_laws(role, link.algorithm(role), reasons, link)
     table = {
         "role": role,
         "id": id,
@@ -117,13 +113,20 @@ def _check_algorithm(
         "version": entry.version,
         "link": link.digest,
         "parameters": {k: v for k, v in link.table[role].items() if k != "id"},
-        "laws": [_describe_outcome(outcome) for outcome in outcomes],
+        "laws": [_report_outcome(outcome, as_json) for outcome in outcomes],
     }
     return f"{role} '{id}' of {entry.distribution} {entry.version}", table
 
 
-def _describe_outcome(outcome: sdk.testing.Verdict) -> dict[str, str]:
+def _report_outcome(outcome: sdk.testing.Verdict, as_json: bool) -> dict[str, str]:
+    """Print a verdict at once, unless as JSON; return its JSON."""
     law = outcome.law
+    if not as_json:
+        from rich.text import Text
+
+        text = law.statement if outcome.status == "ok" else " ".join(outcome.detail.split())
+        status = f"{outcome.status:<7}", _STYLES[outcome.status]
+        console().print(Text.assemble(status, f"  {law.name:<{_WIDTH}}  {text}"))
     return {"law": law.name, "says": law.statement, "status": outcome.status, "detail": outcome.detail}
 
 
@@ -156,12 +159,3 @@ def _build_link(
             except ConfigError:
                 tables["bar"] = dict(sdk.exercises.ONE_CLUSTER)
     return sdk.resolve.resolve(tables, registry, source=link_file or "", overridden=overridden)
-
-
-def _print_outcomes(outcomes: Sequence[sdk.testing.Verdict], width: int) -> None:
-    from rich.text import Text
-
-    out = console()
-    for o in outcomes:
-        text = o.law.statement if o.status == "ok" else " ".join(o.detail.split())
-        out.print(Text.assemble((f"{o.status:<7}", _STYLES[o.status]), f"  {o.law.name:<{width}}  {text}"))

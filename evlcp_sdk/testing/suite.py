@@ -73,10 +73,17 @@ def check(
     >>> {outcome.status for outcome in check("modulation", load_link().algorithm("modulation"))}
     {'ok'}
     """
-    excuses = excuses or {}
+    return list(check_laws(role, algorithm, excuses or {}, link))
+
+
+def check_laws(
+    role: str, algorithm: Any, excuses: Mapping[str, str], link: Link | None = None
+) -> Iterator[Verdict]:
+    """`check`, law by law."""
     _check_excuses(role, excuses)
     subject = subject_of(role, algorithm, link)
-    return [apply_law(law, subject, excuses) for law in laws_of(role)]
+    for law in laws_of(role):
+        yield apply_law(law, subject, excuses)
 
 
 def check_link(link: Link) -> Iterator[tuple[str, Verdict]]:

@@ -85,7 +85,7 @@ def test_the_command_says_one_line_a_law(evlcp):
     assert last.endswith(f"{len(lines) - 1} ok, 1 failed")
     done = evlcp("check", "tracking", "none")
     assert done.code == 0
-    assert "skipped  straight-line   leaves every quantity as measured" in done.out
+    assert "skipped  straight-line       leaves every quantity as measured" in done.out
 
 
 @pytest.mark.parametrize(
