@@ -137,9 +137,11 @@ class BarLight:
             lambda q: packet_chips(self.symbols(q), link.codebook, link.packet.pilot_every)
         )
         self._transmitter_id = transmitter_id
-        for key, payload in (("symbols", "symbols"), ("text", "messages")):
+        for key, payload in (("symbols", "symbols"), ("text", "messages"), ("chips_file", "symbols")):
             if getattr(bar, key) is not None and bar.payload != payload:
                 raise ConfigError(f"{source}.payload = {bar.payload!r}: expected {payload!r} beside {key}")
+        if bar.chips_file is not None and bar.symbols is not None:
+            raise ConfigError(f"{source}.symbols: expected them, or chips_file, not both")
         if bar.chips_file is not None:
             self._chips = _read_chips(Path(bar.chips_file), link.codebook.clusters)
             self.packet_chips = len(self._chips)

@@ -109,6 +109,16 @@ def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
         (LINK, {"symbols": ((tuple(range(16)),),)}, r"bars\.0\.symbols\.0: 1 frames, expected 10"),
         (LINK, {"symbols": (((99,) * 16,) * 10,)}, r"symbol 99 .*expected 0 to 63"),
         (resolve({"bar": {"rows": 48}}), {"chips_file": str(tmp_path / "chips.npy")}, "8 clusters"),
+        (
+            LINK,
+            {"chips_file": "a.npy", "payload": "data"},
+            "payload = .data.: expected .symbols. beside chips_file",
+        ),
+        (
+            LINK,
+            {"chips_file": "a.npy", "symbols": symbols},
+            r"bars\.0\.symbols: expected them, or chips_file",
+        ),
         (LINK, {"chips_file": str(tmp_path / "no.npy")}, "cannot be read"),
         (LINK, {"chips_file": str(tmp_path / "text.npy")}, r"not a \.npy file of plain numbers"),
     ):
