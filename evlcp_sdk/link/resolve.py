@@ -137,8 +137,10 @@ class Link:
         """The algorithm of a role, e.g. `link.algorithm("ranging")`.
 
         Raises:
-            ConfigError: It is no step of the link's framing.
+            ConfigError: There is no such role, or it is no step of the link's framing.
         """
+        if role not in ROLES:
+            raise ConfigError(f"no role named '{role}'{suggest(role, list(ROLES))}")
         if role in STEPS and role not in self.algorithms:
             raise ConfigError(f"{role}{_describe_unused_role(self.table['framing']['id'])}")
         return self.algorithms[role]
@@ -158,11 +160,8 @@ class Link:
         >>> link.with_algorithm("ranging", link.algorithm("ranging"), id="mine").table["ranging"]["id"]
         'mine'
         """
-        if role not in ROLES:
-            raise ConfigError(f"no role named '{role}'{suggest(role, list(ROLES))}")
-        if role != "framing":
-            # Raises if it is no step of the link's framing.
-            self.algorithm(role)
+        # Raises if it is no step of the link's framing.
+        self.algorithm(role)
         parts = self._objects_by_section() | {role: algorithm}
         described = is_dataclass(algorithm) and not isinstance(algorithm, type)
         parameters = asdict(algorithm) if described else {}
@@ -229,7 +228,7 @@ def load_link(
         source = str(path)
         table = load_led_file(read_toml(path), Path(path).parent, f"{source}: ")
     overridden = set()
-    for override in overrides:
+    for override in [overrides] if isinstance(overrides, str) else overrides:
         section, key, value = _parse_override(override)
         keys = table.setdefault(section, {})
         if not isinstance(keys, dict):

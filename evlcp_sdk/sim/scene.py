@@ -528,7 +528,8 @@ def load_scene(
     if link is not None:
         table["link"] = _FileLink(link.table) if isinstance(link, Link) else _FileLink.read(link)
     _read_links(table, folder, f"{where}: ")
-    pairs = overrides.items() if isinstance(overrides, Mapping) else map(_parse_override, overrides)
+    texts = [overrides] if isinstance(overrides, str) else overrides
+    pairs = texts.items() if isinstance(texts, Mapping) else map(_parse_override, texts)
     for key, value in pairs:
         _set_value(table, key, value)
         _read_links(table, folder, "--set ")
