@@ -51,6 +51,10 @@ _ON_GRID_CHIPS = 0.6
 """How far from its expected time a preamble keeps the lock; latency grows by 0.5 behind a wiper."""
 
 
+_MAX_STRAYS = 4
+"""Newest peaks off a lock's grid that are kept: a single cluster's data may look like a preamble in between."""
+
+
 @dataclass(frozen=True)
 class BarkerSync(Synchronization):
     """Preamble correlation at sub-chip steps, then a Kalman filter of clock and latency.
@@ -149,7 +153,7 @@ class _Peak(NamedTuple):
 
 
 class SyncState(NamedTuple):
-    """What synchronization remembers: recent event counts (OFF, ON) a step, its lock, and a peak off it.
+    """What synchronization remembers: recent event counts (OFF, ON) a step, its lock, and peaks off it.
 
     `power` and `known` are the mean square of the positive correlations lately, and their number.
     """
@@ -160,7 +164,7 @@ class SyncState(NamedTuple):
     power: float = 0.0
     known: int = 0
     clock: _Clock | None = None
-    stray: _Peak | None = None
+    strays: tuple[_Peak, ...] = ()
 
 
 class BarkerSynchronizer:
@@ -200,7 +204,7 @@ class BarkerSynchronizer:
     ) -> tuple[SyncState, list[SyncLock]]:
         """Count events, correlate what is complete, return a lock for each preamble (see `Synchronizer`)."""
         span, guard = self._span, self._guard
-        before_bin, before, next_bin, power, known, clock, stray = state
+        before_bin, before, next_bin, power, known, clock, strays = state
         until_bin = int(until_us // self._bin_us)
         if before_bin is None:
             # A preamble starts with a dark chip: the first event may already be the edge at its end.
@@ -226,11 +230,11 @@ class BarkerSynchronizer:
             power, known, many = _kernels.find_peaks(rho, counts, span, lo, guard, past, enough, peaks)
             for lag in peaks[:many].tolist():
                 peak, old = _Peak(first_bin, counts, lag, float(rho[lag])), clock
-                clock, stray = self._accept_peak(clock, stray, peak)
+                clock, strays = self._accept_peak(clock, strays, peak)
                 if clock is not old:
                     locks.append(self._build_lock(clock, peak.quality))
             lo = lags - guard
-        return SyncState(first_bin, counts, first_bin + lo, power, known, clock, stray), locks
+        return SyncState(first_bin, counts, first_bin + lo, power, known, clock, strays), locks
 
     def _refine_peak(self, peak: _Peak) -> _Preamble:
         first_bin, counts, lag, _ = peak
@@ -267,27 +271,28 @@ class BarkerSynchronizer:
         return [(first + middle, noise) for middle, noise in found]
 
     def _accept_peak(
-        self, clock: _Clock | None, stray: _Peak | None, peak: _Peak
-    ) -> tuple[_Clock, _Peak | None]:
+        self, clock: _Clock | None, strays: tuple[_Peak, ...], peak: _Peak
+    ) -> tuple[_Clock, tuple[_Peak, ...]]:
         """Add a preamble to its lock; off it, a better one than its only one, or a second, begins a new lock.
 
         One symbol on all clusters at once blinks in phase, too, but can agree with 16 chips of 26 only. Most
         peaks of a lamp are on no grid: only those that may be are refined.
         """
         if clock is None:
-            return self._start_clock(peak), None
+            return self._start_clock(peak), ()
         followed = self._follow_clock(clock, peak)
         if followed is not None:
-            return followed, None
+            return followed, ()
         if clock.preambles == 1 and peak.quality > clock.quality + _CLEAR_DIFFERENCE:
-            return self._start_clock(peak), None
+            return self._start_clock(peak), ()
         if peak.quality < clock.quality - _CLEAR_DIFFERENCE:
-            return clock, stray
-        if stray is not None and self._can_follow(self._peak_us(stray), 0.0, peak, 2):
-            followed = self._follow_clock(self._start_clock(stray), peak)
-            if followed is not None:
-                return followed, None
-        return clock, peak
+            return clock, strays
+        for stray in strays:
+            if self._can_follow(self._peak_us(stray), 0.0, peak, 2):
+                followed = self._follow_clock(self._start_clock(stray), peak)
+                if followed is not None:
+                    return followed, ()
+        return clock, (*strays, peak)[-_MAX_STRAYS:]
 
     def _peak_us(self, peak: _Peak) -> float:
         """Where a peak's preamble begins, to within a chip."""
