@@ -147,7 +147,7 @@ class Codebook:
 
     Raises:
         ConfigError: A code has chips other than 0 and 1, there is one codeword only, or two rows have the
-            same edges, so that no camera could distinguish them.
+            same edges, or the only pilot is the preamble, so that no camera could distinguish them.
 
     Two codebooks are equal when their digests are.
 
@@ -190,6 +190,8 @@ class Codebook:
                     like = int(np.flatnonzero((edges == edges[second]).all(1))[0])
                     what = "are equal" if (code[like] == code[second]).all() else "have the same edges"
                     raise ConfigError(f"codebook {name}: rows {like} and {second} {what}")
+        if len(self.pilots) == 1 and np.array_equal(self.pilots[0], self.preamble):
+            raise ConfigError("codebook pilots: that of the only cluster is the preamble, expected another")
 
     @classmethod
     def of_values(cls, profile: str, preamble: ArrayLike, pilots: ArrayLike, codewords: ArrayLike) -> Self:

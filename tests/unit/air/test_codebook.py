@@ -106,6 +106,8 @@ CHIPS = Codebook("ppm", np.array([0, 1, 1]), np.array([[0, 1, 0], [1, 0, 0]]), n
          "preamble: expected a 1-D array of chips 0 and 1; values of -1"),
         (lambda: Codebook("x", CHIPS.preamble, CHIPS.pilots, np.array([[1, 1, 1], [0, 1, 0], [0, 0, 0]])),
          "codewords: rows 0 and 2 have the same edges"),
+        (lambda: Codebook("x", CHIPS.preamble, [CHIPS.preamble], CHIPS.codewords),
+         "pilots: that of the only cluster is the preamble"),
         (lambda: CHIPS.require_pairs("decoding", "a", "b"),
          r"decoding 'a' reads pair codes.*the preamble are others; try"),
         (lambda: packet_chips([[0] * 15], book_of("wh4x2")), r"expected \(frames, 16 clusters\)"),
