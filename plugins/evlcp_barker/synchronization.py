@@ -52,7 +52,7 @@ _ON_GRID_CHIPS = 0.6
 
 
 _MAX_STRAYS = 4
-"""Newest peaks off a lock's grid that are kept: a single cluster's data may look like a preamble in between."""
+"""Newest peaks off a lock's grid that are kept: one cluster's data in between may look like a preamble."""
 
 
 @dataclass(frozen=True)
