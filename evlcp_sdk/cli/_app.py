@@ -134,8 +134,6 @@ def _command_names(app: typer.Typer) -> set[str]:
 
 def _find_fault(added: typer.Typer, known: set[str]) -> str | None:
     """Why the commands of a plugin cannot be added, in one line; None where they can."""
-    if not (added.registered_commands or added.registered_groups):
-        return None
     # With a callback, a single command is built as a group, too.
     added.callback()(lambda: None)
     try:

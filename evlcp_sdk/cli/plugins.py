@@ -21,19 +21,13 @@ def plugins(ctx: typer.Context, as_json: Json = False) -> None:
 
     Exit code 0, also when plugins are broken and left out.
     """
-    # The registry of the command line, which knows whose commands are broken.
-    table = tabulate_plugins(ctx.obj)
-    print_result(_format_table(table), table, as_json, 2)
-
-
-def tabulate_plugins(registry: sdk.registry.Registry) -> dict[str, list[dict[str, Any]]]:
-    """Roles, algorithms and broken plugins, as `--json` prints them."""
-    # This may find more broken plugins.
+    # The registry of the command line knows whose commands are broken; this may find more.
+    registry: sdk.registry.Registry = ctx.obj
     sdk.records.find_sinks(registry)
     sdk.records.find_message_kinds(registry)
     entries = registry.list_algorithms()
     count = Counter((e.algorithm.role, e.algorithm.id) for e in entries)
-    return {
+    table: dict[str, list[dict[str, Any]]] = {
         "roles": [{"role": r.name, "verb": r.verb, "default": r.default} for r in sdk.roles.ROLES.values()],
         "algorithms": [
             {
@@ -50,6 +44,7 @@ def tabulate_plugins(registry: sdk.registry.Registry) -> dict[str, list[dict[str
             {"plugin": b.plugin, "distribution": b.distribution, "reason": b.reason} for b in registry.broken
         ],
     }
+    print_result(_format_table(table), table, as_json, 2)
 
 
 def _find_fault(installed: sdk.registry.InstalledAlgorithm) -> str | None:

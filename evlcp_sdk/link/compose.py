@@ -137,12 +137,5 @@ def iterate_packets(
 
 def beacon_of_site(site: BarSite, user: bytes = b"") -> Beacon:
     """The beacon of a bar at a site, with the user's own bytes."""
-    return Beacon(
-        site.latitude_deg,
-        site.longitude_deg,
-        site.height_m,
-        site.heading_deg,
-        site.tilt_deg,
-        site.length_m,
-        user,
-    )
+    place = site.latitude_deg, site.longitude_deg, site.height_m
+    return Beacon(*place, site.heading_deg, site.tilt_deg, site.length_m, user)

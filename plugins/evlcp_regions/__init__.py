@@ -8,13 +8,9 @@ from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 @hookimpl
 def evlcp_algorithms() -> Iterator[Algorithm]:
     """The algorithms of this package."""
-    path = "evlcp_regions.detection"
-    yield Algorithm("detection", "rhythm", f"{path}:Rhythmic", 1, "what blinks in the rhythm of the chips")
-    yield Algorithm(
-        "detection",
-        "spots",
-        "evlcp_regions.spots:Spots",
-        1,
-        "single lights that go on and off, followed in a shaking image",
-    )
-    yield Algorithm("detection", "whole", f"{path}:Whole", 1, "the whole image is one region")
+    for id, target, summary in (
+        ("rhythm", "detection:Rhythmic", "what blinks in the rhythm of the chips"),
+        ("spots", "spots:Spots", "single lights that go on and off, followed in a shaking image"),
+        ("whole", "detection:Whole", "the whole image is one region"),
+    ):
+        yield Algorithm("detection", id, f"evlcp_regions.{target}", 1, summary)
