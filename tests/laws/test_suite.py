@@ -91,7 +91,6 @@ def test_the_command_says_one_line_a_law(evlcp):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (("ranging", "pco"), "did you mean 'poc'?"),
         (("rangin", "poc"), "no role named 'rangin' (known: detection,"),
         (("ranging", "poc", "--set", "foo=3"), "ranging.foo = 3: unknown key"),
         (("ranging", "poc", "--set", "foo"), "--set foo: expected KEY=VALUE or TABLE.KEY=VALUE"),

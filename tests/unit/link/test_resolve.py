@@ -171,20 +171,6 @@ def test_the_text_tells_meaning_unit_bounds_and_default(registry: Registry) -> N
     assert "# Farthest distance told. [m, default none]" in lines
 
 
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("bar.led_pitch_m=1e-308", "expected greater than or equal to 0.000001"),
-        ("bar.columns=4096", "bar.rows = 96, bar.columns = 4096: expected at most 65536 LEDs"),
-        ("air.chip_rate_hz=1e-300", "expected greater than or equal to 1"),
-    ],
-)
-def test_sizes_that_no_memory_or_number_holds_are_refused(setting: str, message: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        load_link(overrides=[setting])
-    assert str(caught.value).endswith(message)
-
-
 ONE_LED = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
 WRONG: tuple[Any, ...] = (-1, 0, "x", 1e300, math.nan, math.inf, [], {}, True, 10**30)
 

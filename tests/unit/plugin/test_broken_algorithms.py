@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from evlcp_uart.framing import Uart
-from numpy.typing import NDArray
+from evlcp_wh.pilots import WhPilots
 
 from evlcp_sdk.errors import PluginError
 from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.plugin.hooks import Algorithm
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.plugin.roles import Detection, Modulation, Pilots, Ranging, Tracking
+from evlcp_sdk.plugin.roles import Detection, Modulation, Ranging, Tracking
 from evlcp_sdk.run import receive, receive_to_folder
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.values import DecodedFrame, SoftSymbols
@@ -60,17 +60,6 @@ class Steps:
 
 def step_result(state: int, *found: Any) -> Any:
     return state + 1, list(found)
-
-
-@dataclass(frozen=True)
-class OddPilots(Pilots):
-    """Its preamble has values of no chips."""
-
-    def preamble(self) -> NDArray[np.uint8]:
-        return np.full(4, 2, np.uint8)
-
-    def codes(self, clusters: int) -> NDArray[np.uint8]:
-        return np.eye(clusters, dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -159,17 +148,15 @@ CASES: dict[tuple[str, str], tuple[Any, str]] = {
         make_algorithm(Uart, codebook=boom),
         "KeyError: 'boom' (test_broken_algorithms.py, line ",
     ),
-    ("framing", "no book"): (
-        make_algorithm(Uart, codebook=lambda *_: None),
-        "TypeError: gave NoneType at codeb",
-    ),
     ("framing", "book is five"): (
         make_algorithm(Uart, codebook=lambda *_: 5),
         "TypeError: gave int at codebook(),",
     ),
-    ("modulation", "words are alike"): (words(np.repeat(LONE, 2, 0)), "codebook codewords: rows 0 and 1"),
     ("modulation", "one word"): (words(LONE), "codebook codewords: 1 row, expected two or more; "),
-    ("pilots", "odd"): (OddPilots, "codebook preamble: expected a 1-D array of chips 0 and 1"),
+    ("pilots", "odd"): (
+        make_algorithm(WhPilots, preamble=lambda _: np.full(4, 2)),
+        "codebook preamble: expected a 1-D array of chips 0 and 1",
+    ),
     ("ranging", "unfinished"): (Unfinished, "TypeError: Can't instantiate abstract class Unfinished"),
     ("ranging", "no data"): (NoData, "TypeError: "),
     ("ranging", "refuses"): (Refuses, "KeyError: 'boom' (test_broken_algorithms.py, line "),

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from evlcp_barker import _kernels
 from evlcp_barker.bound import due_chips, guard_chips, least_correlation, preamble_share
-from evlcp_barker.pilots import Barker13Pilots
 from evlcp_barker.synchronization import BarkerSync
 from evlcp_wh.modulation import Wh4x2
 from evlcp_wh.pilots import WhPilots
@@ -12,7 +11,6 @@ from numpy.testing import assert_allclose
 
 from evlcp_sdk.air.codebook import BARKER13, Codebook, chips_of_values
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
-from evlcp_sdk.errors import ConfigError
 
 CHIP_US, START_US = 100.0, 5000.0
 
@@ -88,11 +86,6 @@ def locks_of(t_us, p, sync=None, step_us=1000):
 def numbers(locks):
     """Which packet each lock is, as a real number: whole where it is right."""
     return np.array([(lock.packet_t_us - START_US) / PERIOD_US for lock in locks])
-
-
-def test_more_clusters_than_codes_are_refused():
-    with pytest.raises(ConfigError, match="27 clusters, expected at most 26"):
-        Barker13Pilots().codes(27)
 
 
 @pytest.mark.parametrize(("steps", "min_events", "share"), [(4, 0, 1), (10, 0, 1), (10, 520, 1), (4, 0, 0.7)])
