@@ -8,7 +8,7 @@ from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.plugin.roles import Measure, Ranging
+from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import NO_RANGE, FrameView, Range
@@ -51,7 +51,8 @@ class CentroidRanging(Ranging):
         if left < least:
             raise ConfigError(
                 f"ranging 'centroid' uses {max(left, 0)} of {bar.clusters} clusters (skip_outer ="
-                f" {skip}), expected at least min_clusters = {least}"
+                f" {skip}), expected at least min_clusters = {least}; use"
+                f" '{ROLES['ranging'].default_for(bar, codebook.unpaired_codes)}' for this layout"
             )
         if not bar.has_distinct_centres:
             raise ConfigError("ranging 'centroid' needs clusters apart: use 'none' for this layout")
