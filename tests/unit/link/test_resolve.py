@@ -133,6 +133,7 @@ def test_the_digest_holds_table_codebook_and_revisions(registry: Registry) -> No
     assert len(digest) == 64
     for override in ("ranging.min_spacing=8", "camera.focal_mm=35"):
         assert load_link(None, [override], registry).digest == digest
+        assert load_link(None, override, registry).digest == digest
     for override in ("ranging.min_spacing=9", "ranging.id=centroid"):
         assert load_link(None, [override], registry).digest != digest
     assert load_link(None, (), Registry(fakes(revision=2))).digest != digest
