@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self
 
+import numpy as np
+
 from evlcp_sdk.errors import PluginError, StreamError, blame_class
 from evlcp_sdk.values import Events, Triggers
 
@@ -173,11 +175,17 @@ class EventSource(ABC):
                     return
                 self._pending = piece
                 continue
-            if len(events) <= max_events and len(triggers) <= max_events:
+            n, m = len(events), len(triggers)
+            if n <= max_events and m <= max_events:
                 self._pending = nothing
             else:
-                self._pending = events[max_events:], triggers[max_events:]
-                events, triggers = events[:max_events], triggers[:max_events]
+                # What comes first in time comes in the first piece.
+                if n > max_events:
+                    n, m = max_events, int(np.searchsorted(triggers.t_us, events.t_us[max_events], "right"))
+                if m > max_events:
+                    n, m = min(n, int(np.searchsorted(events.t_us, triggers.t_us[max_events]))), max_events
+                self._pending = events[n:], triggers[m:]
+                events, triggers = events[:n], triggers[:m]
             self._given["events"] += len(events)
             self._given["triggers"] += len(triggers)
             yield events, triggers
