@@ -117,9 +117,9 @@ def _detect_format(path: Path) -> str:
 def _open_text(path: Path, stack: ExitStack) -> tuple[IO[bytes], TextIO]:
     """Open a file, and the text in it, perhaps gzipped."""
     raw = stack.enter_context(path.open("rb"))
-    start = raw.peek(2)[:2]
-    file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if start == b"\x1f\x8b" else raw
-    encoding = "utf-16" if start in _UTF_16 else "utf-8-sig"
+    is_packed = raw.peek(2).startswith(b"\x1f\x8b")
+    file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if is_packed else raw
+    encoding = "utf-16" if file.peek(2).startswith(_UTF_16) else "utf-8-sig"
     return raw, stack.enter_context(io.TextIOWrapper(file, encoding, "replace"))
 
 

@@ -65,9 +65,14 @@ def _detect_format(name: str) -> str:
             return ""
         with path.open("rb") as file:
             start = file.read(16)
+        by_suffix = _SUFFIXES.get(path.suffix.lower(), "")
+        if path.suffix.lower() == ".dat":
+            from evlcp_sdk.io.lists import is_list
+
+            # Tables of text are often named so, too.
+            by_suffix = "" if is_list(path) else by_suffix
     except OSError:
         return ""
-    by_suffix = _SUFFIXES.get(path.suffix.lower(), "")
     return next((found for magic, found in _STARTS.items() if start.startswith(magic)), by_suffix)
 
 

@@ -90,8 +90,8 @@ PLACED = {
 @pytest.mark.parametrize("name", LISTS | PLACED)
 def test_text(name, tmp_path):
     """The name of the file does not say that it is a table."""
-    (tmp_path / "a.txt").write_text((LISTS | PLACED)[name])
-    expect(tmp_path / "a.txt", placed=name in PLACED)
+    (tmp_path / "a.dat").write_text((LISTS | PLACED)[name])
+    expect(tmp_path / "a.dat", placed=name in PLACED)
 
 
 @pytest.mark.parametrize("name", ["windows", "a line of units", "a title", "x,y,p,t without a header"])
@@ -102,6 +102,7 @@ def test_files_of_text(name, tmp_path):
         ("a.csv.gz", gzip.compress(content.encode())),
         ("16.csv", content.encode("utf-16")),
         ("16", content.encode("utf-16")),
+        ("16.gz", gzip.compress(content.encode("utf-16"))),
     ):
         (tmp_path / file).write_bytes(data)
         expect(tmp_path / file, placed=name in PLACED)
