@@ -1,5 +1,6 @@
 """Drop what no receiver may see, for the formats that are not decoded word by word."""
 
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -34,24 +35,22 @@ class Sieve:
         self._unit, self._first = unit, first
         self._clock = CameraClock(width or 1 << 16, height or 1 << 16, is_sparse=True)
 
-    def sift(self, events: Events) -> Events:
-        """Return those of the next events to keep, and earlier ones whose times are now confirmed.
+    def sift(self, events: Events) -> Iterator[Events]:
+        """Yield those of the next events to keep, and earlier ones whose times are now confirmed.
 
-        The columns stay the caller's.
+        No piece goes on over a restart of the clock. The columns stay the caller's.
         """
         return self._restore_times(self._clock.feed(events))
 
-    def close(self) -> Events:
-        """End the stream; return the events still held back that nothing contradicts."""
+    def close(self) -> Iterator[Events]:
+        """End the stream; yield the events still held back that nothing contradicts."""
         return self._restore_times(self._clock.close())
 
-    def _restore_times(self, pieces: list[Events]) -> Events:
-        kept = []
+    def _restore_times(self, pieces: list[Events]) -> Iterator[Events]:
         for piece in pieces:
             first_us = int(piece.t_us[0])
             offset_us = int(self._clock.camera_us(first_us)) - first_us
-            kept.append(Events(piece.t_us + np.int64(offset_us), piece.x, piece.y, piece.p))
-        return kept[0] if len(kept) == 1 else Events.concat(kept)
+            yield Events(piece.t_us + np.int64(offset_us), piece.x, piece.y, piece.p)
 
     @property
     def counts(self) -> dict[str, int]:

@@ -178,8 +178,8 @@ class ColumnSource(EventSource):
             # Unless all is read, the later half waits for events that may be earlier.
             due = len(events) // 2 if has_more else len(events)
             waiting = [events[due:]]
-            yield self._sieve.sift(events[:due])
-        yield self._sieve.close()
+            yield from self._sieve.sift(events[:due])
+        yield from self._sieve.close()
         if fault is not None:
             raise fault
 

@@ -2,7 +2,6 @@
 
 import math
 import time
-from bisect import bisect_right
 from collections.abc import Callable
 
 import numpy as np
@@ -121,7 +120,8 @@ class ReplaySource(WrappingSource):
         self._last_us: int | None = None  # the last time that was replayed
         self._past_damage = 0
         self._is_damaged = False  # this piece of the recording
-        # Camera clock, us, and own clock, s, of the first piece and of each after a skipped silence.
+        # Camera clock, us, and own clock, s, of the first piece and of each after a skipped silence or a
+        # restart of the clock.
         self._origins: list[tuple[int, float]] = []
         self._skipped = {"silences_skipped": 0, "silences_skipped_us": 0}
 
@@ -140,9 +140,10 @@ class ReplaySource(WrappingSource):
         first, _ = span_us(events, triggers)
         if self._last_us is None:
             self._origins.append((first, self._clock()))
-        elif damaged and first - self._last_us > DAMAGE_US:
-            self._skipped["silences_skipped"] += 1
-            self._skipped["silences_skipped_us"] += first - self._last_us
+        elif first < self._last_us or (damaged and first - self._last_us > DAMAGE_US):
+            if first > self._last_us:
+                self._skipped["silences_skipped"] += 1
+                self._skipped["silences_skipped_us"] += first - self._last_us
             start_us, start_s = self._origins[-1]
             self._origins.append((first, start_s + (self._last_us - start_us) * self._s_per_us))
         start_us, start_s = self._origins[-1]
@@ -159,8 +160,8 @@ class ReplaySource(WrappingSource):
         """Return when a time of the recording is due, by `clock`; None before the first piece."""
         if not self._origins:
             return None
-        at = bisect_right(self._origins, t_us, key=lambda origin: origin[0])
-        start_us, start_s = self._origins[max(at - 1, 0)]
+        earlier = (origin for origin in reversed(self._origins) if origin[0] <= t_us)
+        start_us, start_s = next(earlier, self._origins[0])
         return start_s + (t_us - start_us) * self._s_per_us
 
     @property

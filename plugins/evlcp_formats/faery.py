@@ -43,23 +43,25 @@ class FaerySource(EventSource):
         width, height = (None, None) if size == UNKNOWN_SIZE else size
         self._sieve = Sieve("row", 1, width, height)
         super().__init__(target, name, width, height, None, target.stat().st_size, self._sieve)
-        self._packets: Iterator[Any] = iter(stream)
-        self._row = 1
+        self._pieces = self._read(iter(stream))
+
+    def _read(self, packets: Iterator[Any]) -> Iterator[Events]:
+        row = 1
+        try:
+            for packet in packets:
+                row += len(packet)
+                columns = (packet["t"], packet["x"], packet["y"], packet["on"])
+                # Copies, as faery may reuse the packet.
+                yield from self._sieve.sift(Events.of(*map(np.array, columns)))
+        except Exception as error:
+            raise InputError(f"{self.path}: at event {row}: {error}") from error
+        yield from self._sieve.close()
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         """Return the next packet of the file, of any size, or None at the end."""
-        try:
-            packet = next(self._packets, None)
-        except Exception as error:
-            raise InputError(f"{self.path}: at event {self._row}: {error}") from error
-        if packet is None:
-            events = self._sieve.close()
-            return (events, Triggers.empty()) if len(events) else None
-        self._row += len(packet)
-        columns = (packet["t"], packet["x"], packet["y"], packet["on"])
-        events = Events.of(*(np.array(column) for column in columns))  # copies: faery may reuse the packet
-        return self._sieve.sift(events), Triggers.empty()
+        events = next(self._pieces, None)
+        return None if events is None else (events, Triggers.empty())
 
     def close(self) -> None:
         """Close the file."""
-        self._packets = iter(())
+        self._pieces = iter(())

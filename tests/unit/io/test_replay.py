@@ -1,5 +1,6 @@
 """A replay gives out a recording at its own pace, changed in nothing else."""
 
+import numpy as np
 import pytest
 
 from evlcp_sdk.io import ReplaySource, open_source, write_events
@@ -43,3 +44,14 @@ def test_each_slice_comes_when_its_time_is_over(recording):
         (9000, [9000], []),
         (12_000, [], [12_000]),
     ]
+
+
+def test_a_clock_that_restarts_keeps_its_pace(tmp_path):
+    t_us = np.tile(np.arange(0, 50_000, 20), 2)
+    ones = np.ones(len(t_us), int)
+    np.savez(tmp_path / "a.npz", t_us=t_us, x=ones, y=ones, p=ones)
+    clock = Clock()
+    with ReplaySource(open_source(tmp_path / "a.npz"), clock=clock, sleep=clock.sleep) as source:
+        assert sum(map(len, source.chunks())) == len(t_us)
+        assert clock.now == pytest.approx(100.1, abs=1e-3)
+        assert source.clock_s(50_000.0) == pytest.approx(clock.now, abs=1e-3)
