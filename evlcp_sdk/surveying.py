@@ -36,8 +36,8 @@ def calibrate(
     """Estimate focal length, principal point and distortion from bars at known places.
 
     `recordings` show bars at `sites`; `poses` are places and times of the camera, and `name` is the name in
-    messages of their file, which has a heading and a line a pose. `limit_px` is the largest uncertainty of
-    the image's corners; `link` and `registry` are those of `receive`.
+    messages of their file. `limit_px` is the largest uncertainty of the image's corners; `link` and
+    `registry` are those of `receive`.
 
     Raises:
         InputError: A recording cannot be read.
@@ -77,10 +77,10 @@ def _check_layouts(links: Mapping[str, Link]) -> None:
 def _check_recordings(recordings: Sequence[str], poses: Sequence[KnownPose], source: str) -> None:
     names = [Path(url).name for url in recordings]
     known = names if len(names) > 1 else ["", *names]
-    for line, pose in enumerate(poses, 2):
+    for pose in poses:
         if pose.recording not in known:
             expected = f"expected one of {', '.join(names)}"
-            raise ConfigError(f"{source}: line {line}: recording = {pose.recording!r}: {expected}")
+            raise ConfigError(f"{source}: line {pose.line}: recording = {pose.recording!r}: {expected}")
 
 
 def _make_view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> CalibrationView:
@@ -159,9 +159,9 @@ def survey(
     placing = select_positioning_links(links)
     _check_layouts(placing)
     _check_recordings(recordings, poses, name)
-    for line, pose in enumerate(poses, 2):
+    for pose in poses:
         if pose.attitude is None:
-            raise ConfigError(f"{name}: line {line}: a survey needs heading_deg, pitch_deg and roll_deg")
+            raise ConfigError(f"{name}: line {pose.line}: a survey needs heading_deg, pitch_deg and roll_deg")
     known_ids = {site.transmitter_id for site in known}
     first, first_link = poses[0], next(iter(placing.values()))
     axes = LocalAxes(first.latitude_deg, first.longitude_deg, first.height_m)

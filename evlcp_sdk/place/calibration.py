@@ -57,6 +57,7 @@ class KnownPose:
         position_sigma_m: Standard deviation of its place (WGS-84, above the ellipsoid) in each axis, m.
         attitude: With heading; None if it is unknown.
         attitude_sigma_deg: Standard deviation of a rotation about each axis, degrees.
+        line: Of the file.
     """
 
     recording: str
@@ -67,6 +68,7 @@ class KnownPose:
     position_sigma_m: float
     attitude: Attitude | None
     attitude_sigma_deg: float
+    line: int = 0
 
 
 def read_poses(path: Path | str) -> list[KnownPose]:
@@ -100,6 +102,7 @@ def read_poses(path: Path | str) -> list[KnownPose]:
                 value.get("position_sigma_m", 0.01),
                 Attitude(value["pitch_deg"], value["roll_deg"], value["heading_deg"]) if has_angles else None,
                 value.get("attitude_sigma_deg", 0.1),
+                line,
             )
         )
     return poses

@@ -97,8 +97,8 @@ def test_a_bar_that_looks_curved_is_tilted_within_its_sigma() -> None:
 
 def test_what_cannot_be_surveyed_is_reported() -> None:
     seen = views(np.random.default_rng(10), 0.02, 0.05)
-    with pytest.raises(ConfigError, match="line 2: a survey needs heading_deg"):
-        survey(["never-read.raw"], [KnownPose("", 0.0, 35.0, 137.0, 5.0, 0.01, None, 0.1)], name="p.csv")
+    with pytest.raises(ConfigError, match="line 7: a survey needs heading_deg"):
+        survey(["never-read.raw"], [KnownPose("", 0.0, 35.0, 137.0, 5.0, 0.01, None, 0.1, 7)], name="p.csv")
     with pytest.raises(ConfigError, match="no view shows a bar"):
         survey_bars([dataclasses.replace(view, bars=()) for view in seen], AXES, 0.96, CAMERA)
     wrong = dataclasses.replace(seen[3], enu_m=seen[3].enu_m + np.array([3.0, 0.0, 0.0]))
