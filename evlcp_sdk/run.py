@@ -401,6 +401,8 @@ def convert(
                     if stopped():
                         break
             except InputError as fault:
+                if not any(counts.values()):
+                    raise
                 error = fault
             if stopped() and not isinstance(source, EventSource) and is_recording(source):
                 raise InterruptedRunError(f"interrupted; {out} is not written")

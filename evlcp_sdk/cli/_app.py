@@ -1,12 +1,14 @@
 """The `evlcp` command line, with the commands of plugins."""
 
 import importlib
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from inspect import cleandoc
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -63,7 +65,24 @@ def _parse_once(command: Any, parse: Callable[..., Any], ctx: Any, args: list[st
             if "--config" in option.opts:
                 message += f": {ctx.info_name} goes by one link; run it once for each"
             ctx.fail(message)
-    return parse(ctx, args)
+    rest = parse(ctx, args)
+    _refuse_overwriting(ctx)
+    return rest
+
+
+def _refuse_overwriting(ctx: Any) -> None:
+    """Refuse an option -o that names a file which is read, perhaps as `list:FILE?unit=ms`."""
+
+    def flatten(value: Any) -> list[str]:
+        values = value if isinstance(value, (list, tuple)) else [value]
+        return [str(one) for one in values if one is not None]
+
+    names = [name for key, value in ctx.params.items() if key != "out" for name in flatten(value)]
+    for out in filter(os.path.isfile, flatten(ctx.params.get("out"))):
+        for name in names + [name.partition(":")[2].partition("?")[0] for name in names]:
+            with suppress(OSError):
+                if Path(name).samefile(out):
+                    ctx.fail(f"-o {out}: it is read, and would be overwritten; give another name")
 
 
 @contextmanager

@@ -32,6 +32,12 @@ def test_a_recording_that_is_converted_in_part_is_not_written(demo_raw: Path, tm
         counts = convert(source, tmp_path / "part.raw", stopped=lambda: next(asked, True))["counts"]
     with RawSource(tmp_path / "part.raw") as part:
         assert sum(map(len, part.chunks())) == counts["events"] > 0
+    # Of a table that is wrong from its first row on nothing is written over an earlier one.
+    (tmp_path / "wrong.csv").write_text("t_us,x,y,p\n1,2,3,7\n")
+    before = (tmp_path / "part.raw").read_bytes()
+    with pytest.raises(InputError, match="line 2: polarity 7"):
+        convert(tmp_path / "wrong.csv", tmp_path / "part.raw", size=(1280, 720))
+    assert (tmp_path / "part.raw").read_bytes() == before
 
 
 def test_the_last_packet_comes_too_and_the_source_is_closed(demo_raw: Path) -> None:

@@ -178,6 +178,16 @@ def test_usage_and_configuration_end_with_2(evlcp, demo_raw, tmp_path, args, mes
     assert "Traceback" not in done.err
 
 
+def test_no_output_is_written_over_what_is_read(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("t,p\n5,1\n")
+    for args in (("convert", path), ("convert", f"list:{path}?unit=ms"), ("diagnose", demo_raw, "-c", path)):
+        done = evlcp(*args, "-o", tmp_path / "." / "a.csv")
+        assert done.code == 2
+        assert "it is read, and would be overwritten" in words(done.err)
+    assert path.read_text() == "t,p\n5,1\n"
+
+
 def test_what_goes_by_one_link_refuses_another(evlcp: Evlcp) -> None:
     done = evlcp("diagnose", "never-read.raw", "-c", "a.toml", "-c", "b.toml")
     assert done.code == 2
