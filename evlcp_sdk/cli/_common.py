@@ -5,7 +5,8 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -54,8 +55,14 @@ def print_json(value: object, indent: int | None = None) -> None:
     echo(json.dumps(value, indent=indent))
 
 
-def print_result(text: str, table: object, as_json: bool, indent: int | None = None) -> None:
-    """Print a command's result: a text, unless it is empty, or JSON."""
+def print_result(
+    text: str, table: object, as_json: bool, indent: int | None = None, out: Path | None = None
+) -> None:
+    """Print a command's result, a text unless it is empty, or JSON; on stderr if stdout is its file `out`."""
+    with suppress(OSError):
+        if out is not None and os.path.samestat(out.stat(), os.fstat(1)):
+            print_stderr(json.dumps(table, indent=indent) if as_json else text)
+            return
     if as_json:
         print_json(table, indent)
     elif text:

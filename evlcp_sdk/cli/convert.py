@@ -52,7 +52,7 @@ def convert(
         format_count(counts["triggers"], "trigger"),
         *(f"{one['count']} {one['meaning']}" for one in result["losses"].values()),
     ]
-    print_result(f"{out}: {', '.join(contents)}", {"out": str(out)} | result, as_json)
+    print_result(f"{out}: {', '.join(contents)}", {"out": str(out)} | result, as_json, out=out)
     if result["error"] is not None:
         print_stderr(result["error"])
         raise typer.Exit((UnpluggedError if result["unplugged"] else InputError).exit_code)

@@ -88,9 +88,11 @@ def _flush_stdout() -> bool:
     """Write the rest of stdout; whether that worked. A fault is reported, unless the reader has left."""
     import errno
 
+    if sys.stdout is None:
+        print_stderr("standard output: it is closed")
+        return False
     try:
-        if sys.stdout is not None:
-            sys.stdout.flush()
+        sys.stdout.flush()
     except OSError as fault:
         if fault.errno != errno.EPIPE:
             print_stderr(f"standard output: {fault.strerror}")

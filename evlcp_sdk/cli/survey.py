@@ -11,7 +11,7 @@ import typer
 
 from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, print_json
+from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, print_result
 from evlcp_sdk.cli._receiving import PlaceOptions
 from evlcp_sdk.formatting import format_count
 
@@ -65,17 +65,13 @@ def survey(
 def _write(surveyed: Sequence[sdk.survey.SurveyedBar], out: Path, *, as_json: bool) -> None:
     with sdk.files.Outputs() as outputs:
         outputs.open(out).write(sdk.sites.to_toml([bar.site for bar in surveyed]))
-    if as_json:
-        bars = [
-            asdict(bar.site)
-            | {"covariance_m2": bar.covariance_m2.tolist(), "views": bar.views}
-            | ({"contradicted": bar.contradiction} if bar.contradiction else {})
-            for bar in surveyed
-        ]
-        print_json({"bars": bars})
-    else:
-        for bar in surveyed:
-            console().print(_format_bar(bar))
+    bars = [
+        asdict(bar.site)
+        | {"covariance_m2": bar.covariance_m2.tolist(), "views": bar.views}
+        | ({"contradicted": bar.contradiction} if bar.contradiction else {})
+        for bar in surveyed
+    ]
+    print_result("\n".join(map(_format_bar, surveyed)), {"bars": bars}, as_json, out=out)
 
 
 def _format_bar(bar: sdk.survey.SurveyedBar) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import StreamError
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.plugin.writer import LAST_TIME_US, EventWriter
 from evlcp_sdk.values import Events, Triggers
 
@@ -91,7 +92,8 @@ class CsvWriter(EventWriter):
 
     def _write(self, events: Events, triggers: Triggers) -> None:
         if len(triggers):
-            raise StreamError(f"{self.path}: {len(triggers)} triggers, which a CSV file has no place for")
+            found = format_count(len(triggers), "trigger")
+            raise StreamError(f"{self.path}: {found}, which a CSV file has no place for: .npz and .raw have")
         for first in range(0, len(events), CSV_ROWS):
             piece = events[first : first + CSV_ROWS]
             columns = (column.tolist() for column in (piece.t_us, piece.x, piece.y, piece.p))

@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
-from evlcp_sdk.errors import InputError, import_extra
+from evlcp_sdk.errors import InputError, import_extra, short_message
 from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import ChunkReader, RawSource, format_header
 from evlcp_sdk.io.urls import split_options
@@ -211,7 +211,7 @@ def _read_bag(path: Path, topic: str | None, stack: ExitStack) -> Iterator[Event
         raise
     except Exception as fault:
         # A damaged bag makes a reader fail in any way.
-        raise InputError(f"{at}: {type(fault).__name__}: {fault}") from fault
+        raise InputError(f"{at}: found a damaged bag ({short_message(fault)})") from fault
 
 
 def _choose_reader(path: Path) -> Callable[[Path, str | None, ExitStack], Iterator[EventPacket]]:

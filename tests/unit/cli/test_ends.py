@@ -50,6 +50,15 @@ def test_a_full_stdout_is_one_line(arguments: str, demo_raw: Path, shell: Shell)
     done = shell(f"{EVLCP} {arguments.format(demo=demo_raw)} > /dev/full")
     assert done.stderr == "evlcp: standard output: No space left on device\n"
     assert done.returncode == 1
+    done = shell(f"{EVLCP} {arguments.format(demo=demo_raw)} >&-")
+    assert done.stderr.endswith("evlcp: standard output: it is closed\n")
+    assert done.returncode == 1
+
+
+def test_a_recording_on_stdout_is_nothing_else(demo_raw: Path, shell: Shell) -> None:
+    done = shell(f"{EVLCP} convert {demo_raw} -o /dev/stdout --format EVT3 | {EVLCP} info - --json")
+    assert done.stderr == "evlcp: /dev/stdout: 764,142 events, 0 triggers\n"
+    assert json.loads(done.stdout)["losses"] == {}
 
 
 def test_a_reader_who_leaves_is_no_fault(shell: Shell) -> None:
