@@ -44,10 +44,12 @@ HIGH: Final = 9  # both: the last confirmed TIME_HIGH
 STATE_SLOTS: Final = 10
 
 # A step of TIME_HIGH by more than one is confirmed unless most of the next `FOLLOWERS` in so many bytes are
-# still on the clock before it. A step back by up to `NEAR_US` is an early word, not another clock.
+# still on the clock before it. A step back by up to `NEAR_US` is an early word, not another clock; one by up
+# to `REPEAT_US` that is confirmed starts a block that comes twice, unless the clock restarts near 0.
 FOLLOWERS: Final = 3
 LOOKAHEAD_BYTES: Final = 1 << 18
 NEAR_US: Final = 10_000
+REPEAT_US: Final = 100_000
 
 # After missing bytes all words are misaligned. Of aligned words none is of a reserved type, of others a
 # third. Of `ALIGNMENT_WORDS` at least `ALIGNMENT_RESERVED` have to be reserved, eight times as many as from
@@ -138,7 +140,7 @@ def _confirm_time(
 ) -> Integer:
     """Check words[i], a TIME_HIGH above `low_bits` that comes after `before`, by those that follow it.
 
-    Returns 2 for slightly early, 1 for confirmed, 0 for not, -1.
+    Returns 2 for early or repeated, 1 for confirmed, 0 for not, -1.
     """
     shift = 8 * size - 4
     ring = (int64(1) << shift) - 1
@@ -146,7 +148,8 @@ def _confirm_time(
     step = (high - before) & ring
     if step <= 1:
         return int64(1)
-    if (ring + 1 - step) << low_bits <= NEAR_US:
+    back_us = (ring + 1 - step) << low_bits
+    if back_us <= NEAR_US:
         return int64(2)
     # After a short step the next but one is past it in any case.
     most = FOLLOWERS if step > FOLLOWERS else 1
@@ -165,7 +168,9 @@ def _confirm_time(
     else:
         if not final and i + 1 + LOOKAHEAD_BYTES // size > len(words):
             return int64(-1)
-    return int64(agree >= against)
+    if agree < against:
+        return int64(0)
+    return int64(2) if back_us <= REPEAT_US and high << low_bits > NEAR_US else int64(1)
 
 
 @njit

@@ -38,12 +38,16 @@ def judge_time_high(words, k, bits, low_bits, before):
     ahead = (words[k] - before) % ring
     if ahead <= 1:
         return "believed"
-    if (ring - ahead) << low_bits <= 10_000:
+    back_us = (ring - ahead) << low_bits
+    if back_us <= 10_000:
         return "early"
     near = words[k + 1 : k + 1 + (1 << 18) // size]
     following = [w % ring for w in near if w >> bits == 8][: 3 if ahead > 3 else 1]
     against = sum((n - before) % ring < ahead for n in following)
-    return "doubtful" if against > len(following) - against else "believed"
+    if against > len(following) - against:
+        return "doubtful"
+    repeated = back_us <= 100_000 and words[k] % ring << low_bits > 10_000
+    return "early" if repeated else "believed"
 
 
 def doubtful(out, words, k, bits, low_bits, before, at):
