@@ -72,14 +72,12 @@ def _parse_once(command: Any, parse: Callable[..., Any], ctx: Any, args: list[st
 
 def _refuse_overwriting(ctx: Any) -> None:
     """Refuse an option -o that names a file which is read, perhaps as `list:FILE?unit=ms`."""
-
-    def flatten(value: Any) -> list[str]:
+    names: dict[bool, list[str]] = {True: [], False: []}
+    for key, value in ctx.params.items():
         values = value if isinstance(value, (list, tuple)) else [value]
-        return [str(one) for one in values if one is not None]
-
-    names = [name for key, value in ctx.params.items() if key != "out" for name in flatten(value)]
-    for out in filter(os.path.isfile, flatten(ctx.params.get("out"))):
-        for name in names + [name.partition(":")[2].partition("?")[0] for name in names]:
+        names[key == "out"] += [str(one) for one in values if one is not None]
+    for out in filter(os.path.isfile, names[True]):
+        for name in names[False] + [name.partition(":")[2].partition("?")[0] for name in names[False]]:
             with suppress(OSError):
                 if Path(name).samefile(out):
                     ctx.fail(f"-o {out}: it is read, and would be overwritten; give another name")

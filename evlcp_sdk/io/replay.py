@@ -141,9 +141,8 @@ class ReplaySource(WrappingSource):
         if self._last_us is None:
             self._origins.append((first, self._clock()))
         elif first < self._last_us or (damaged and first - self._last_us > DAMAGE_US):
-            if first > self._last_us:
-                self._skipped["silences_skipped"] += 1
-                self._skipped["silences_skipped_us"] += first - self._last_us
+            self._skipped["silences_skipped"] += first > self._last_us
+            self._skipped["silences_skipped_us"] += max(first - self._last_us, 0)
             start_us, start_s = self._origins[-1]
             self._origins.append((first, start_s + (self._last_us - start_us) * self._s_per_us))
         start_us, start_s = self._origins[-1]

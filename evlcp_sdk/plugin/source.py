@@ -176,16 +176,13 @@ class EventSource(ABC):
                 self._pending = piece
                 continue
             n, m = len(events), len(triggers)
-            if n <= max_events and m <= max_events:
-                self._pending = nothing
-            else:
-                # What comes first in time comes in the first piece.
-                if n > max_events:
-                    n, m = max_events, int(np.searchsorted(triggers.t_us, events.t_us[max_events], "right"))
-                if m > max_events:
-                    n, m = min(n, int(np.searchsorted(events.t_us, triggers.t_us[max_events]))), max_events
-                self._pending = events[n:], triggers[m:]
-                events, triggers = events[:n], triggers[:m]
+            # What comes first in time comes in the first piece.
+            if n > max_events:
+                n, m = max_events, int(np.searchsorted(triggers.t_us, events.t_us[max_events], "right"))
+            if m > max_events:
+                n, m = min(n, int(np.searchsorted(events.t_us, triggers.t_us[max_events]))), max_events
+            self._pending = nothing if n == len(events) and m == len(triggers) else (events[n:], triggers[m:])
+            events, triggers = events[:n], triggers[:m]
             self._given["events"] += len(events)
             self._given["triggers"] += len(triggers)
             yield events, triggers

@@ -166,6 +166,7 @@ SITES = [BarSite(1, 35.1, 137.0, 50.0)]
         ("REC -o OUT --sites S --clock-zero 9999-12-31T23:59:59.9", "expected 1970 to 2199"),
         ("REC -o OUT --sites none.toml", "none.toml: cannot be read"),
         ("REC -o OUT --gnss none.csv", "needs --sites"),
+        ("REC -o REC", "it is read, and would be overwritten"),
     ],
 )
 def test_usage_and_configuration_end_with_2(evlcp, demo_raw, tmp_path, args, message) -> None:
@@ -176,16 +177,6 @@ def test_usage_and_configuration_end_with_2(evlcp, demo_raw, tmp_path, args, mes
     assert message in words(done.err)
     assert not (tmp_path / "out").exists()
     assert "Traceback" not in done.err
-
-
-def test_no_output_is_written_over_what_is_read(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
-    path = tmp_path / "a.csv"
-    path.write_text("t,p\n5,1\n")
-    for args in (("convert", path), ("convert", f"list:{path}?unit=ms"), ("diagnose", demo_raw, "-c", path)):
-        done = evlcp(*args, "-o", tmp_path / "." / "a.csv")
-        assert done.code == 2
-        assert "it is read, and would be overwritten" in words(done.err)
-    assert path.read_text() == "t,p\n5,1\n"
 
 
 def test_what_goes_by_one_link_refuses_another(evlcp: Evlcp) -> None:
