@@ -149,7 +149,9 @@ class ColumnSource(EventSource):
         }
         self.step_us = _common_step_us(self._unit, times)
         if self.step_us >= _COARSE_US:
-            header["step"] = f"times are rounded to {_format_duration(self.step_us)}"
+            scales = ((1_000_000, "s"), (1000, "ms"), (1, "us"))
+            size, name = next(one for one in scales if self.step_us >= one[0])
+            header["step"] = f"times are rounded to {self.step_us / size:g} {name}"
         super().__init__(self.path, table.format, *table.size, header, size_bytes)
         self.guessed = "; ".join(filter(None, (self._unit.guess, header.get("step"))))
 
@@ -337,12 +339,6 @@ def _common_step_us(unit: TimeUnit, times: NDArray[Any]) -> int:
         steps = steps[steps > 4 * digits] if digits > 0.01 else steps
     steps_us = np.rint(steps[(steps >= 0.5) & (steps < LAST_TIME_US)]).astype(np.int64)
     return math.gcd(*steps_us.tolist())
-
-
-def _format_duration(step_us: int) -> str:
-    if step_us < 1000:
-        return f"{step_us} us"
-    return f"{step_us / 1000:g} ms" if step_us < 1_000_000 else f"{step_us / 1e6:g} s"
 
 
 def _find_present(column: NDArray[Any]) -> Any:

@@ -168,11 +168,6 @@ class Fields:
         """Numbers of the columns time, polarity, and perhaps x and y."""
         return (self.time, self.polarity, *(self.places or ()))
 
-    def renumber(self, numbers: Sequence[int]) -> "Fields":
-        """Return the fields of a table whose columns have these numbers."""
-        places = (numbers[self.places[0]], numbers[self.places[1]]) if self.places else None
-        return Fields(numbers[self.time], numbers[self.polarity], places, self.unit)
-
 
 def fields_from_names(names: Sequence[str]) -> Fields | None:
     """Recognize the columns of a list of events by their names; None without a time and a polarity.

@@ -117,8 +117,7 @@ def _detect_format(path: Path) -> str:
 def _open_text(path: Path, stack: ExitStack) -> tuple[IO[bytes], TextIO]:
     """Open a file, and the text in it, perhaps gzipped."""
     raw = stack.enter_context(path.open("rb"))
-    is_packed = raw.peek(2).startswith(b"\x1f\x8b")
-    file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if is_packed else raw
+    file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if raw.peek(2)[:2] == b"\x1f\x8b" else raw
     encoding = "utf-16" if file.peek(2).startswith(_UTF_16) else "utf-8-sig"
     return raw, stack.enter_context(io.TextIOWrapper(file, encoding, "replace"))
 
@@ -228,7 +227,7 @@ class _TextTable:
         rows = [self.split_cells(line) for line in lines[1 + bool(unit) : 9]]
         if rows and all(len(row) == len(head) + 1 for row in rows):
             # R writes no name for the column of row numbers.
-            named = named.renumber(range(1, len(head) + 1))
+            named = fields_from_names(["", *head]) or named
         return replace(named, unit=named.unit or unit), 1 + bool(unit)
 
     def _recognize_values(self, sample: list[str]) -> Fields | None:
