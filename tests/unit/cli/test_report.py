@@ -114,11 +114,6 @@ def test_the_page_tells_everything(summary: Summary) -> None:
     assert text.count('<span class="yes">better</span>') == verdicts.count("better")
     assert "arXiv 2510.17203" in text
     assert "d" * 64 in text
-    for tag in re.findall(
-        r"<(?:script|link|img|iframe)[^>]*>", re.sub(r"<script>.*?</script>", "", text, flags=re.S)
-    ):
-        assert "src=" not in tag
-        assert 'href="data:,"' in tag or "href=" not in tag
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")

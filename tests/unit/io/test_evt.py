@@ -167,15 +167,6 @@ def test_writer_refuses(events, triggers, message, tmp_path):
             writer.write(events, triggers)
     assert str(path) in str(caught.value)
     assert len(read_events(path)) == (1 if "at 1 us" in message else 0)  # nothing of the refused piece
-
-
-def test_writer_leaves_what_was_there_when_it_fails(tmp_path):
-    path = tmp_path / "a.raw"
-    path.write_bytes(b"before")
-    with pytest.raises(StreamError), RawWriter(path, 10, 10) as writer:
-        writer.write(Events.of([1], [10], [0], [0]))
-    assert path.read_bytes() == b"before"
-    assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(StreamError, match="closed"):
         writer.write(Events.empty())
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evlcp_sdk.io import open_source, write_events
+from evlcp_sdk.io import open_source
 
 REAL = Path(__file__).parents[3].parent / "shared" / "recordings" / "real"
 NAMES = ["ros_evt3_trigger.raw", "ros_py_test_events_1.raw"]
@@ -24,7 +24,7 @@ def digests_of(events):
 
 @pytest.mark.skipif(not REAL.exists(), reason=f"needs the recordings in {REAL}")
 @pytest.mark.parametrize("name", NAMES)
-def test_columns_have_the_expected_digests_in_every_format(name, tmp_path):
+def test_columns_have_the_expected_digests(name):
     expected = json.loads((REAL / "expected.json").read_text())[name]
     with open_source(REAL / name) as source:
         events, triggers = source.read()
@@ -35,10 +35,3 @@ def test_columns_have_the_expected_digests_in_every_format(name, tmp_path):
     assert np.unique(triggers.channel).tolist() == expected["trigger_ids"]
     assert f"{source.width}x{source.height}" == expected["size"]
     assert source.losses == {}
-    for copy, kind in (("a.raw", "EVT3"), ("b.raw", "EVT2"), ("c.npz", "NPZ")):
-        write_events(tmp_path / copy, events, source.width, source.height, triggers, kind)
-        with open_source(tmp_path / copy) as again:
-            got, edges = again.read()
-        assert digests_of(got) == expected["sha256"]
-        for column in ("t_us", "channel", "value"):
-            assert np.array_equal(getattr(edges, column), getattr(triggers, column))
