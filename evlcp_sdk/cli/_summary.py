@@ -86,9 +86,7 @@ def _print_transmitters(summary: Mapping[str, Any], out: "Console") -> None:
                 _format_transmitter(t),
                 *(t[name] for name in several),
                 f"{t['frames_found']} of {t['frames_expected']}",
-                f"{t['symbols_erased'] / (t['symbols_erased'] + t['symbols_given']):.1%}"
-                if t["symbols_erased"]
-                else "-",
+                _format_erased(t),
                 _format_or_dash(t["quality"], "{:.2f}"),
                 _format_or_dash(t["clock_ppm"], "{:+.0f} ppm"),
                 _format_distances(t["distance_first_m"], t["distance_last_m"]),
@@ -154,6 +152,11 @@ def _format_fix(fix: Mapping[str, Any]) -> str:
 def _format_transmitter(figures: Mapping[str, Any]) -> str:
     number, echo_of = figures["transmitter"], figures["echo_of"]
     return f"{number}" if echo_of is None else f"{number}, reflection of {echo_of}"
+
+
+def _format_erased(figures: Mapping[str, Any]) -> str:
+    erased = figures["symbols_erased"]
+    return f"{erased / (erased + figures['symbols_given']):.1%}" if erased else "-"
 
 
 def _describe_positions(positions: Mapping[str, Any]) -> str:

@@ -40,12 +40,16 @@ def print_table(
 
 
 def _split_columns(columns: Sequence[Sequence[str]], names: int, width: int) -> Iterator[list[Sequence[str]]]:
-    from rich.cells import cell_len
-
     part = list(columns[:names])
     for column in columns[names:]:
-        if len(part) > names and sum(max(map(cell_len, one)) + _GAP for one in (*part, column)) > width:
+        if len(part) > names and _total_width([*part, column]) > width:
             yield part
             part = list(columns[:names])
         part.append(column)
     yield part
+
+
+def _total_width(columns: Iterable[Sequence[str]]) -> int:
+    from rich.cells import cell_len
+
+    return sum(max(map(cell_len, column)) + _GAP for column in columns)

@@ -61,8 +61,7 @@ def compare(
                 "results of a campaign stand alone: their variants are the campaign's links",
                 param_hint="REC...",
             )
-        with sdk.store.Store(Path(recordings[0])) as store:
-            code, comparison = 0, sdk.comparison.compare_links(sdk.summary.summarize(store))
+        code, comparison = 0, _load_comparison(Path(recordings[0]))
     else:
         code, comparison = _compare_recordings(recordings, variants or [], link_files, overrides or [], jobs)
     if comparison.tables:
@@ -99,6 +98,11 @@ def _is_campaign(url: str) -> bool:
             return file.read(len(_SQLITE)) == _SQLITE
     except OSError:
         return False
+
+
+def _load_comparison(path: Path) -> sdk.comparison.Comparison:
+    with sdk.store.Store(path) as store:
+        return sdk.comparison.compare_links(sdk.summary.summarize(store))
 
 
 def _compare_recordings(

@@ -130,10 +130,7 @@ def _run_jobs(
             if advance is not None:
                 advance(len(outcomes), len(jobs))
             if outcome.value is None:
-                message = outcome.fault.message if outcome.fault else "no result"
-                print_stderr(message)
-                if result.as_json:
-                    print_json({"status": "failed", "error": message, "recording": {"path": outcome.job.url}})
+                _print_failure(outcome, as_json=result.as_json)
             else:
                 print_end(outcome.value, outcome.job.folder, lines, as_json=result.as_json)
         if stopped():
@@ -142,6 +139,13 @@ def _run_jobs(
             where = "was printed" if folder is None else f"is in {folder}"
             raise InterruptedRunError(f"interrupted; what was decoded until then {where}")
     return outcomes
+
+
+def _print_failure(outcome: sdk.jobs.Outcome[ReceiveJob, dict[str, Any]], *, as_json: bool) -> None:
+    message = outcome.fault.message if outcome.fault else "no result"
+    print_stderr(message)
+    if as_json:
+        print_json({"status": "failed", "error": message, "recording": {"path": outcome.job.url}})
 
 
 def _exit_code(outcomes: Sequence[sdk.jobs.Outcome[ReceiveJob, dict[str, Any]]], *, strict: bool) -> int:
@@ -191,13 +195,16 @@ def _decode(
     )
     if stopped is not None:
         stop = stopped.or_when(lambda: job.folder is None and lines is not None and lines.closed)
-        name = "standard input" if job.url == sdk.open.STDIN else Path(job.url).name
-        with progress_bar(name, by_bytes=True) as advance:
+        with progress_bar(_source_name(job.url), by_bytes=True) as advance:
             return run(lines=lines, advance=advance, stopped=stop)
     silence_matplotlib()
     # A terminal sends Ctrl-C to workers, too.
     with stop_on_request() as stop:
         return run(stopped=stop)
+
+
+def _source_name(url: str) -> str:
+    return "standard input" if url == sdk.open.STDIN else Path(url).name
 
 
 def _make_jobs(recordings: Sequence[str], out: Path | None, lines: LinePrinter | None) -> list[ReceiveJob]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -58,6 +59,10 @@ def survey(
         assert plan is not None
         known = None if place.attitude_file is None else sdk.attitude.AttitudeLog.read(place.attitude_file)
         surveyed = sdk.surveying.survey_along_track(recordings, plan, links, attitude=known)
+    _write(surveyed, out, as_json=as_json)
+
+
+def _write(surveyed: Sequence[sdk.survey.SurveyedBar], out: Path, *, as_json: bool) -> None:
     with sdk.files.Outputs() as outputs:
         outputs.open(out).write(sdk.sites.to_toml([bar.site for bar in surveyed]))
     bars = [

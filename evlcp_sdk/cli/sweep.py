@@ -72,11 +72,16 @@ def sweep(
         numbers = {k: v for k, v in asdict(progress).items() if k != "faults"}
         print_json({"results": str(path), **numbers, "failed": len(progress.faults)})
     else:
-        console().print(
-            f"{plan.name}: {progress.done} of {progress.tasks} tasks,"
-            f" {progress.points_done} of {progress.points} points,"
-            f" {progress.bit_errors:,} of {progress.bits:,} bits wrong"
-        )
-        if not dry_run:
-            console().print(f"written: {path}; look at it: evlcp report {path} -o report.html", style="dim")
+        _print_progress(plan.name, progress, None if dry_run else path)
     raise typer.Exit(max((fault.exit_code for _, fault in progress.faults), default=0))
+
+
+def _print_progress(name: str, progress: sdk.collect.Progress, written: Path | None) -> None:
+    screen = console()
+    screen.print(
+        f"{name}: {progress.done} of {progress.tasks} tasks,"
+        f" {progress.points_done} of {progress.points} points,"
+        f" {progress.bit_errors:,} of {progress.bits:,} bits wrong"
+    )
+    if written is not None:
+        screen.print(f"written: {written}; look at it: evlcp report {written} -o report.html", style="dim")

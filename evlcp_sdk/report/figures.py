@@ -29,7 +29,7 @@ from evlcp_sdk.report.recording import (
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.rx.boxes import Box, bounding_box, box_of
-from evlcp_sdk.values import Events, Frame, PresenceMap
+from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 _DPI = 150
 _MAX_TRANSMITTERS = 3
@@ -70,12 +70,7 @@ class Figures(ChartSink):
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
         """Keep regions, and the clearest frames with their presence maps."""
         if stage == "regions":
-            if value.id not in self.regions:
-                self.region_count += 1
-                if len(self.regions) == _MAX_REGIONS:
-                    del self.regions[min(self.regions, key=lambda number: self.regions[number][0])]
-            times, box = self.regions.get(value.id, (0, box_of(value)))
-            self.regions[value.id] = times + 1, bounding_box([box, box_of(value)])
+            self._add_region(value)
         elif stage == "separation":
             self._presence = value
         elif stage == "frame" and self._presence is not None:
@@ -83,6 +78,14 @@ class Figures(ChartSink):
             has_room = best is None and len(self.clearest) < _MAX_TRANSMITTERS
             if has_room or (best is not None and value.soft.quality > best[0].soft.quality):
                 self.clearest[value.transmitter] = value, self._presence
+
+    def _add_region(self, region: Region) -> None:
+        if region.id not in self.regions:
+            self.region_count += 1
+            if len(self.regions) == _MAX_REGIONS:
+                del self.regions[min(self.regions, key=lambda number: self.regions[number][0])]
+        times, box = self.regions.get(region.id, (0, box_of(region)))
+        self.regions[region.id] = times + 1, bounding_box([box, box_of(region)])
 
     def finish(self) -> None:
         """Draw the figures."""

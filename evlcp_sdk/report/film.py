@@ -245,10 +245,7 @@ def draw_film(
         end_us = film.start_us + (number + 1) * film.picture_us
         while True:
             time = (chunk.t_us - film.start_us) / film.picture_us - number
-            shown = chunk[(time >= open_from) & (time < 1)]
-            x, y = shown.x.astype(np.int64) - film.left, shown.y.astype(np.int64) - film.top
-            inside = (x >= 0) & (x < film.columns) & (y >= 0) & (y < film.rows)
-            np.add.at(lit, (shown.p[inside].astype(np.int64), y[inside], x[inside]), 1.0)
+            _add_events(lit, chunk[(time >= open_from) & (time < 1)], film)
             if len(chunk) and chunk.t_us[-1] >= end_us:
                 break
             following = next(chunks, None)
@@ -303,6 +300,12 @@ def _box_of_frame(frame: Frame) -> tuple[NDArray[np.float64], NDArray[np.float64
 def _box_of_region(region: Region) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     middle, half = np.array([region.x_px, region.y_px]), np.array([region.width_px, region.height_px]) / 2
     return middle - half, middle + half
+
+
+def _add_events(lit: NDArray[np.float32], events: Events, film: Film) -> None:
+    x, y = events.x.astype(np.int64) - film.left, events.y.astype(np.int64) - film.top
+    inside = (x >= 0) & (x < film.columns) & (y >= 0) & (y < film.rows)
+    np.add.at(lit, (events.p[inside].astype(np.int64), y[inside], x[inside]), 1.0)
 
 
 def _render_events(lit: NDArray[np.float32], film: Film) -> Image.Image:

@@ -61,10 +61,13 @@ class Report(ChartSink):
             view, self._view = self._view, None
             # A frame without a pilot has no view, and looks as the one with its pilot.
             if view is not None and view.soft.symbols.shape == value.soft.symbols.shape:
-                last = self._motions.get(value.transmitter)
-                has_room = len(self._motions) < _MAX_MOTIONS * max(len(self.run.links), 1)
-                if has_room if last is None else last.shows_less_than(value, view):
-                    self._motions[value.transmitter] = Motion.of(value, view)
+                self._keep_motion(value, view)
+
+    def _keep_motion(self, frame: Frame, view: FrameView) -> None:
+        last = self._motions.get(frame.transmitter)
+        has_room = len(self._motions) < _MAX_MOTIONS * max(len(self.run.links), 1)
+        if has_room if last is None else last.shows_less_than(frame, view):
+            self._motions[frame.transmitter] = Motion.of(frame, view)
 
     def packet(self, packet: Packet) -> None:
         """Keep frames and messages."""

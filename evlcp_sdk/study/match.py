@@ -33,6 +33,10 @@ RECOVERY_CHIPS = 3
 """Time after a cluster is uncovered during which frames that start are still cut."""
 
 
+def _tail_us(packet: PacketFormat) -> float:
+    return TAIL_CHIPS * packet.chip_us
+
+
 def find_start(starts_us: Floats, t_us: float, packet: PacketFormat) -> int | None:
     """Index of the start nearest to a time, within half a pilot; None if there is none.
 
@@ -98,7 +102,7 @@ class SentFrames:
         hidden, cut = (np.zeros((len(chip_numbers), clusters), np.bool_) for _ in range(2))
         if covers:
             _mark_hidden(bar, start_us, end_us, hidden, cut)
-        sent = (start_us >= 0) & (end_us + TAIL_CHIPS * packet.chip_us < truth.duration_us) & ~cut.all(1)
+        sent = (start_us >= 0) & (end_us + _tail_us(packet) < truth.duration_us) & ~cut.all(1)
         # Ranging uses mostly the pilot, whose middle is the time of the distance.
         chips = np.where(lengths > packet.info_chips, packet.pilot_chips, packet.info_chips)
         middle = chips / 2 * packet.chip_us
@@ -180,7 +184,7 @@ def match_frames(
 def _is_cut(sent: SentFrames, truth: Truth, t_us: float, found: set[int], *, road: bool) -> bool:
     """Whether a frame of a bar at a time is cut, or nearly so and the nearest one was not found before."""
     packet = sent.bar.link.packet
-    tail_us = TAIL_CHIPS * packet.chip_us
+    tail_us = _tail_us(packet)
     # With its pilot, until its last events.
     long_us = packet.frame_chips * packet.chip_us + tail_us
     is_at_end = t_us < tail_us or t_us + long_us > truth.duration_us
@@ -203,7 +207,7 @@ def find_sent_packets(bar: SentBar, truth: Truth) -> tuple[Floats, NDArray[np.bo
     period_us = packet.packet_chips / bar.rate_hz * 1e6
     first_us = -bar.start_chip / bar.rate_hz * 1e6
     start_us: Floats = np.arange(len(bar.symbols), dtype=np.float64) * period_us + first_us
-    whole = (start_us >= 0) & (start_us + period_us + TAIL_CHIPS * packet.chip_us < truth.duration_us)
+    whole = (start_us >= 0) & (start_us + period_us + _tail_us(packet) < truth.duration_us)
     distance_m: Floats = np.interp(start_us + period_us / 2, truth.t_us, bar.distance_m)
     return start_us, whole, distance_m
 

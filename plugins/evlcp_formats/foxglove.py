@@ -82,20 +82,13 @@ class Mcap(Sink):
     def packet(self, packet: Packet) -> None:
         """Write the frames of a packet."""
         for frame in packet.frames:
-            if "/frames" not in self._channels:
-                schema = json.dumps(_FRAME).encode()
-                number = self._writer.register_schema("evlcp.Frame", "jsonschema", schema)
-                self._channels["/frames"] = self._writer.register_channel("/frames", "json", number)
-            self._add_message("/frames", frame.t_us, format_frame(frame).encode())
+            self._write_json("/frames", frame.t_us, format_frame(frame))
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a fix, and the filtered place at its time if it is accepted."""
-        from google.protobuf.struct_pb2 import Struct
         from scipy.spatial.transform import Rotation
 
-        integrity = Struct()
-        integrity.update({"bars": list(fix.transmitters), "refusal": fix.refusal} | integrity_fields(fix))
-        self._write_message("/integrity", fix.t_us, integrity)
+        self._write_integrity(fix)
         self._write_scene(fix.t_us)
         if filtered is None:
             return
@@ -135,6 +128,13 @@ class Mcap(Sink):
         )
         message.timestamp.FromNanoseconds(self._to_ns(t_us))
         self._write_message(topic, t_us, message)
+
+    def _write_integrity(self, fix: Fix) -> None:
+        from google.protobuf.struct_pb2 import Struct
+
+        message = Struct()
+        message.update({"bars": list(fix.transmitters), "refusal": fix.refusal} | integrity_fields(fix))
+        self._write_message("/integrity", fix.t_us, message)
 
     def _write_picture(self) -> None:
         if self._picture is None:
@@ -199,6 +199,12 @@ class Mcap(Sink):
             schema = register_schema(self._writer, type(message))
             self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema)
         self._add_message(topic, t_us, message.SerializeToString())
+
+    def _write_json(self, topic: str, t_us: float, text: str) -> None:
+        if topic not in self._channels:
+            schema = self._writer.register_schema("evlcp.Frame", "jsonschema", json.dumps(_FRAME).encode())
+            self._channels[topic] = self._writer.register_channel(topic, "json", schema)
+        self._add_message(topic, t_us, text.encode())
 
     def _add_message(self, topic: str, t_us: float, data: bytes) -> None:
         log_ns = self._to_ns(t_us)

@@ -17,8 +17,11 @@ def evlcp_algorithms() -> Iterator[Algorithm]:
         ("decoding", "wh-transform", "decoding:WhTransform", 1, "presence-weighted WH transform"),
         ("decoding", "ml-soft", "decoding:MlSoft", 1, "likelihoods learned from the pilots"),
         (
-            *("decoding", "motion-feedback", "motion_feedback:MotionFeedback", 2),
-            "ml-soft again after the motion is known",
+            "decoding",
+            "motion-feedback",
+            "motion_feedback:MotionFeedback",
+            2,
+            "ml-soft again, with the motion",
         ),
     ):
         yield Algorithm(role, id, f"evlcp_wh.{target}", revision, summary)
