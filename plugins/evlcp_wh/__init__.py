@@ -21,7 +21,7 @@ def evlcp_algorithms() -> Iterator[Algorithm]:
             "motion-feedback",
             "motion_feedback:MotionFeedback",
             2,
-            "ml-soft again, with the motion",
+            "ml-soft again after the motion is known",
         ),
     ):
         yield Algorithm(role, id, f"evlcp_wh.{target}", revision, summary)

@@ -31,7 +31,7 @@ def estimate_presence(
     _, height, width = sums.shape
     _, rows, columns = out.shape
     size, n = height * width, rows * columns
-    flat, into = sums.reshape(-1, size), out.reshape(clusters, n)
+    flat, into = sums.reshape(len(sums), size), out.reshape(clusters, n)
     # Sums of the square of pixels that begins at each; where it leaves the image, there is no cell.
     square = np.empty((2, 2, size), np.int16)
     by_pixel, values = np.empty(size, np.int8), np.empty((length, n), np.int8)
@@ -96,7 +96,7 @@ def map_pixels(
     clusters, length = codes.shape
     _, rows, columns = selected.shape
     _, height, width = sums.shape
-    flat = sums.reshape(-1, height * width)
+    flat = sums.reshape(len(sums), height * width)
     values, fit = np.empty((length, height * width), np.int8), np.empty(height * width, np.int16)
     for i in range(length):
         pair_values(flat[2 * i], flat[2 * i + 1], values[i])
