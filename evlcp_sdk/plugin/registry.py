@@ -282,7 +282,7 @@ class Registry:
         hooks = {hook.name for hook in self._manager.get_hookcallers(plugin) or ()}
         unknown = [f"has the hook '{hook}', which this SDK does not have" for hook in sorted(hooks - _HOOKS)]
         unmarked = [
-            f"{hook} is not marked with @hookimpl" for hook in _HOOKS - hooks if hasattr(plugin, hook)
+            f"{hook} is not marked with @hookimpl" for hook in sorted(_HOOKS - hooks) if hasattr(plugin, hook)
         ]
         if faults := unknown + unmarked:
             self._manager.unregister(name=name)
