@@ -113,6 +113,14 @@ def test_decoder_does_not_care_about_portions(bodies, cuts, noise):
     assert found == expected
 
 
+@given(st.binary(min_size=1, max_size=80), st.data())
+def test_a_flipped_byte_is_never_accepted_as_the_same(body, data):
+    wire = bytearray(Datagram(4, 0, 1, 2, body).encode())
+    at = data.draw(st.integers(0, len(wire) - 2))
+    wire[at] ^= data.draw(st.integers(1, 255))
+    assert not DatagramDecoder().feed(bytes(wire))
+
+
 def test_endless_line_does_not_fill_memory():
     decoder = DatagramDecoder()
     for _ in range(100):

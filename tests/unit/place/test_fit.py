@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import huber
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.fit import FOCAL_UNIT, Equations, FitState, fit_pose, linearize
+from evlcp_sdk.place.fit import FOCAL_UNIT, Equations, FitState, fit_pose, intersect_sight_lines, linearize
 from evlcp_sdk.place.fit_assessment import Pose, _attitude_excess, _test_fault, assess_fit
 from evlcp_sdk.place.observations import (
     BarView,
@@ -202,6 +202,24 @@ def test_a_mean_shift_test_is_the_larger_fit(bound: float) -> None:
     empty = _test_fault(nothing[:3], nothing, nothing[0], np.eye(14), nothing[:3])
     assert empty[:2] == (0.0, 0)
     assert not np.any(empty[2:])
+
+
+def test_the_nearest_point_to_lines_of_sight() -> None:
+    rng = np.random.default_rng(6)
+    enu, here = rng.uniform(-10, 10, (6, 3)) + np.array([0, 50, 0]), np.array([1.0, 2.0, 3.0])
+    sights = (enu - here) / np.linalg.norm(enu - here, axis=1, keepdims=True) + rng.normal(0, 1e-3, (6, 3))
+    sights /= np.linalg.norm(sights, axis=1, keepdims=True)
+    turns = Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.3], [0, 0, math.pi]]).as_matrix()
+    places, costs = intersect_sight_lines(enu, sights, turns)
+    for turn, place, cost in zip(turns, places, costs, strict=True):
+        lines = sights @ turn.T
+        flat = np.eye(3) - lines[:, :, None] * lines[:, None]
+        want = np.linalg.lstsq(flat.reshape(-1, 3), (flat @ enu[:, :, None]).ravel(), rcond=None)[0]
+        np.testing.assert_allclose(place, want, atol=1e-6)
+        away = enu - want
+        assert cost == pytest.approx(6 - ((away * lines).sum(1) / np.linalg.norm(away, axis=1)).sum())
+    parallel = np.tile([[0.0, 1.0, 0.0]], (6, 1))
+    assert np.isinf(intersect_sight_lines(enu, parallel, turns)[1]).all()
 
 
 def test_clusters_that_count() -> None:
