@@ -18,8 +18,9 @@ _PIECES: Final = 19
 
 
 def load_kernels(links: Sequence[Link], *, positions: bool = False) -> None:
-    """Load a receiver's kernels by frames of drawn bars and a piece of the recording that comes with the SDK,
-    and what positions need of SciPy, which loads slowly.
+    """Load a receiver's kernels by frames of drawn bars and a piece of the recording that comes with the SDK.
+
+    Of `positions`, load SciPy's functions: they have no kernels.
     """
     for link in filter(has_bar_frames, links):
         load_decoder_kernels(link)

@@ -57,7 +57,7 @@ class KnownPose:
         position_sigma_m: Standard deviation of its place (WGS-84, above the ellipsoid) in each axis, m.
         attitude: With heading; None if it is unknown.
         attitude_sigma_deg: Standard deviation of a rotation about each axis, degrees.
-        line: Of the file.
+        line: Of the file, from 1; 0 of no file.
     """
 
     recording: str

@@ -385,6 +385,10 @@ class Role:
             return self.by_layout(bar, unpaired_codes)
         return self.default_unpaired if unpaired_codes and self.default_unpaired is not None else self.default
 
+    def suggest_for(self, bar: BarLayout, unpaired_codes: Collection[str]) -> str:
+        """What an algorithm that refuses a layout suggests instead."""
+        return f"use '{self.default_for(bar, unpaired_codes)}' for this layout"
+
 
 _MAX_RELATIVE_WIDTH = 2.0
 """Widest layout, in heights of its columns, whose columns measure the distance better than its width."""

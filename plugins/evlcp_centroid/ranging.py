@@ -51,8 +51,8 @@ class CentroidRanging(Ranging):
         if left < least:
             raise ConfigError(
                 f"ranging 'centroid' uses {max(left, 0)} of {bar.clusters} clusters (skip_outer ="
-                f" {skip}), expected at least min_clusters = {least}; use"
-                f" '{ROLES['ranging'].default_for(bar, codebook.unpaired_codes)}' for this layout"
+                f" {skip}), expected at least min_clusters = {least};"
+                f" {ROLES['ranging'].suggest_for(bar, codebook.unpaired_codes)}"
             )
         if not bar.has_distinct_centres:
             raise ConfigError("ranging 'centroid' needs clusters apart: use 'none' for this layout")

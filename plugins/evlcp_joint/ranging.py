@@ -238,4 +238,4 @@ def _average_columns(parts: Sequence[Range]) -> Range:
 def _suggest_ranging(bar: BarLayout, codebook: Codebook) -> str:
     if bar.clusters < 2:
         return "no ranging measures the distance of one cluster: use 'none' for this layout"
-    return f"use '{ROLES['ranging'].default_for(bar, codebook.unpaired_codes)}' for this layout"
+    return ROLES["ranging"].suggest_for(bar, codebook.unpaired_codes)

@@ -106,7 +106,7 @@ class PocRanging(Ranging):
             a, b = a[same], b[same]
         a, b = selected[a], selected[b]
         apart = np.hypot(*(centres[:, None] - centres).T)
-        instead = f"use '{ROLES['ranging'].default_for(bar, codebook.unpaired_codes)}' for this layout"
+        instead = ROLES["ranging"].suggest_for(bar, codebook.unpaired_codes)
         if not (bar.has_equal_clusters and bar.has_distinct_centres):
             raise ConfigError(
                 f"ranging 'poc' compares images of clusters, which have to be alike and apart: {instead}"
