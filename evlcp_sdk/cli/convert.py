@@ -27,7 +27,8 @@ def convert(
         str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Of the sensor, where SOURCE does not say.")
     ] = None,
     format: Annotated[
-        str | None, typer.Option(metavar="NAME", help="EVT2, EVT3, BAG, NPZ or CSV, whatever the suffix.")
+        str | None,
+        typer.Option(metavar="NAME", help="EVT2, EVT21, EVT3, BAG, NPZ or CSV for any suffix."),
     ] = None,
     as_json: Json = False,
 ) -> None:

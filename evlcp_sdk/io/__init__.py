@@ -1,4 +1,4 @@
-"""Recordings and cameras in and out: EVT2 and EVT3 RAW files, tables and streams; plugins bring others."""
+"""Recordings and cameras in and out: RAW files, tables and streams; plugins bring others."""
 
 from evlcp_sdk.io.open import open_source, open_writer, read_events, write_events
 from evlcp_sdk.io.raw import RawHeader, RawSource, RawWriter

@@ -105,6 +105,10 @@ uint32: Any = np.uint32
 uintp: Any = np.uintp
 ONE = uintp(1)
 
+# By the bytes of a word: how many bits of the time are below TIME_HIGH, and the types that exist.
+LOW_BITS = np.array([0, 0, 12, 0, 6])
+TYPES = np.array([0, 0, EVT3_TYPES, 0, EVT2_TYPES])
+
 BLOCK_WORDS = 4096
 BURST = 12
 RUN_WORDS = uintp(32)
@@ -135,14 +139,24 @@ def _count_loss(tally: Column, row: Integer, at: Integer) -> None:
 
 
 @njit
+def _find_loss(is_doubtful: Any, is_outside: Any, is_backward: Any) -> Integer:
+    """Return the row of the tally for an event or trigger that is dropped, or -1."""
+    if is_doubtful:
+        return int64(TIME_DOUBTFUL)
+    if is_outside:
+        return int64(OUTSIDE_SENSOR)
+    return int64(TIME_BACKWARD) if is_backward else int64(-1)
+
+
+@njit
 def _confirm_time(
-    words: Column, i: Integer, size: Integer, before: Integer, low_bits: Integer, final: Any
+    words: Column, i: Integer, size: Integer, stride: Integer, before: Integer, final: Any
 ) -> Integer:
-    """Check words[i], a TIME_HIGH above `low_bits` that comes after `before`, by those that follow it.
+    """Check words[i], a TIME_HIGH that comes after `before`, by those that follow it.
 
     Returns 2 for early or repeated, 1 for confirmed, 0 for not, -1.
     """
-    shift = 8 * size - 4
+    shift, low_bits = 8 * size - 4, LOW_BITS[size]
     ring = (int64(1) << shift) - 1
     high = int64(words[i]) & ring
     step = (high - before) & ring
@@ -154,8 +168,8 @@ def _confirm_time(
     # After a short step the next but one is past it in any case.
     most = FOLLOWERS if step > FOLLOWERS else 1
     agree = against = 0
-    stop = min(i + 1 + LOOKAHEAD_BYTES // size, len(words))
-    for k in range(i + 1, stop):
+    end = i + 1 + LOOKAHEAD_BYTES // size
+    for k in range(i + stride, min(end, len(words)), stride):
         w = int64(words[k])
         if w >> shift != 8:
             continue
@@ -166,7 +180,7 @@ def _confirm_time(
         if 2 * max(agree, against) > most:
             break
     else:
-        if not final and i + 1 + LOOKAHEAD_BYTES // size > len(words):
+        if not final and end > len(words):
             return int64(-1)
     if agree < against:
         return int64(0)
@@ -176,6 +190,7 @@ def _confirm_time(
 @njit
 def _read_word_at(words: Column, i: Integer, size: Integer, shift: Integer) -> Integer:
     """Return the word that starts `shift` bytes after the start of words[i]."""
+    i, shift = i + shift // size, shift % size
     word = int64(words[i]) >> (8 * shift)
     if shift:
         word |= (int64(words[i + 1]) << (8 * (size - shift))) & ((int64(1) << (8 * size)) - 1)
@@ -184,38 +199,37 @@ def _read_word_at(words: Column, i: Integer, size: Integer, shift: Integer) -> I
 
 @njit
 def _find_misalignment(
-    words: Column,
-    i: Integer,
-    at: Integer,
-    size: Integer,
-    types: Integer,
-    low_bits: Integer,
-    state: Column,
-    final: Any,
+    words: Column, i: Integer, at: Integer, size: Integer, stride: Integer, state: Column, final: Any
 ) -> Integer:
-    """Return how many bytes after words[i], an unexpected one, aligned words of `types` start.
+    """Return how many bytes after words[i], an unexpected one, aligned words start.
 
     Returns 0 if the words are aligned, or it cannot be told; or -1.
     """
     if at + size * i < state[ALIGNED_UNTIL] and int64(words[i]) >> (8 * size - 4) != 8:
         return int64(0)
-    if i + ALIGNMENT_WORDS >= len(words):
+    # One word more, as a word may start in one and end in the next.
+    checked = stride * (ALIGNMENT_WORDS + 1)
+    if i + checked > len(words):
         return int64(0) if final else int64(-1)
     top = 8 * size - 4
-    shift, fewest, here = int64(0), int64(ALIGNMENT_WORDS), int64(0)
-    for s in range(size):
-        reserved = int64(0)
-        for k in range(i, i + ALIGNMENT_WORDS):
-            reserved += 1 - ((types >> (_read_word_at(words, k, size, s) >> top)) & 1)
+    low_bits, types = LOW_BITS[size], TYPES[size]
+    shift, fewest, most, here = int64(0), int64(ALIGNMENT_WORDS), int64(0), int64(0)
+    for s in range(size * stride):
+        reserved = times = int64(0)
+        for k in range(i, i + checked - stride, stride):
+            kind = _read_word_at(words, k, size, s) >> top
+            reserved += 1 - ((types >> kind) & 1)
+            times += kind == 8
         if s == 0:
             here = reserved
-        elif reserved < fewest:
-            shift, fewest = int64(s), reserved
+        elif reserved < fewest or (reserved == fewest and times > most):
+            # In EVT2.1 the lowest bits of a column are 0, as is a type that exists.
+            shift, fewest, most = int64(s), reserved, times
     if here >= ALIGNMENT_RESERVED and 8 * fewest < here:
         ring = (int64(1) << top) - 1
         before = int64(-1)
         stop = i + LOOKAHEAD_BYTES // size
-        for k in range(i, min(stop, len(words) - 1)):
+        for k in range(i, min(stop, len(words) - stride), stride):
             word = _read_word_at(words, k, size, shift)
             if word >> top != 8:
                 continue
@@ -225,11 +239,12 @@ def _find_misalignment(
                 break
             before = word & ring
         else:
-            if stop <= len(words) - 1 or final:
+            if stop <= len(words) - stride or final:
                 return shift
             return int64(-1)
     # The first words may be aligned, and bytes be missing soon.
-    state[ALIGNED_UNTIL] = at + size * (i + (RECHECK_WORDS if here >= ALIGNMENT_RESERVED else ALIGNED_WORDS))
+    until = i + stride * (RECHECK_WORDS if here >= ALIGNMENT_RESERVED else ALIGNED_WORDS)
+    state[ALIGNED_UNTIL] = at + size * until
     return int64(0)
 
 
@@ -425,21 +440,28 @@ def _find_event_word(words: Column, word: Integer, event: Integer) -> Integer:
 
 @njit
 def _advance_time(
-    words: Column, i: Integer, at: Integer, size: Integer, state: Column, tally: Column, final: Any
+    words: Column,
+    i: Integer,
+    at: Integer,
+    size: Integer,
+    stride: Integer,
+    state: Column,
+    tally: Column,
+    final: Any,
 ) -> Integer:
     """Advance the clock by words[i], a TIME_HIGH, if those that follow it confirm it.
 
     Returns 0; or how many bytes after it aligned words start, if these are not; or -1.
     """
-    low_bits, types = (12, EVT3_TYPES) if size == 2 else (6, EVT2_TYPES)
+    low_bits = LOW_BITS[size]
     ring = (int64(1) << (8 * size - 4)) - 1
     high, before, here = int64(words[i]) & ring, state[HIGH], at + size * i
     step = (high - before) & ring
     if step > 1:
-        askew = _find_misalignment(words, i, at, size, types, low_bits, state, final)
+        askew = _find_misalignment(words, i, at, size, stride, state, final)
         if askew:
             return askew
-    verdict = _confirm_time(words, i, size, before, low_bits, final)
+    verdict = _confirm_time(words, i, size, stride, before, final)
     if verdict < 0:
         return int64(-1)
     state[UNCONFIRMED] = int64(verdict == 0)
@@ -461,7 +483,7 @@ def _advance_time(
 @njit
 def decode_evt3(
     words: Column,
-    place: tuple[Integer, Any],
+    place: tuple[Integer, Any, Integer, Integer],
     size_px: tuple[Integer, Integer],
     state: Column,
     tally: Column,
@@ -474,7 +496,8 @@ def decode_evt3(
     Args:
         words: uint16 (k,).
         place: Byte offset of words[0] in the file, and whether these are the last words. If not, decoding may
-            stop before a TIME_HIGH that the next `LOOKAHEAD_BYTES` have to confirm.
+            stop before a TIME_HIGH that the next `LOOKAHEAD_BYTES` have to confirm. Then `Codec.stride` and
+            `Codec.head`.
         size_px: Columns and rows of the sensor; events beyond are dropped and counted.
         state: int64 (STATE_SLOTS,), passed from call to call.
         tally: int64 (TALLY_ROWS, 2), added to.
@@ -485,7 +508,7 @@ def decode_evt3(
     Returns:
         Words used, events and triggers now in the columns, and how many bytes to skip to aligned words.
     """
-    at, final = place
+    at, final = place[0], place[1]
     t, trigger_t, channel, value = events[0], triggers[0], triggers[1], triggers[2]
     n, m = filled
     i = 0
@@ -520,17 +543,16 @@ def decode_evt3(
         kind = w >> 12
         if kind == EVT3_TIME_HIGH:
             before = state[HIGH]
-            askew = _advance_time(words, i, at, int64(2), state, tally, final)
+            askew = _advance_time(words, i, at, int64(2), int64(1), state, tally, final)
             if askew:
                 break
             if state[HIGH] != before:
                 state[PACKED] = (state[PACKED] & KEEP[EVT3_TIME_LOW]) | PACKED_TIME << PACKED_LOW
         elif kind == EVT3_EXT_TRIGGER:
             clock = base - PACKED_TIME + (state[PACKED] >> PACKED_LOW)
-            if state[UNCONFIRMED]:
-                _count_loss(tally, int64(TIME_DOUBTFUL), at + 2 * i)
-            elif clock < state[LAST]:
-                _count_loss(tally, int64(TIME_BACKWARD), at + 2 * i)
+            loss = _find_loss(state[UNCONFIRMED], False, clock < state[LAST])
+            if loss >= 0:
+                _count_loss(tally, loss, at + 2 * i)
             else:
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0xF, w & 1
                 state[LAST] = clock
@@ -538,7 +560,7 @@ def decode_evt3(
         elif (EVT3_TYPES >> kind) & 1:
             _count_loss(tally, int64(OTHER_WORDS), at + 2 * i)
         else:
-            askew = _find_misalignment(words, i, at, int64(2), int64(EVT3_TYPES), int64(12), state, final)
+            askew = _find_misalignment(words, i, at, int64(2), int64(1), state, final)
             if askew:
                 break
             _count_loss(tally, int64(RESERVED), at + 2 * i)
@@ -549,7 +571,7 @@ def decode_evt3(
 @njit
 def decode_evt2(
     words: Column,
-    place: tuple[Integer, Any],
+    place: tuple[Integer, Any, Integer, Integer],
     size_px: tuple[Integer, Integer],
     state: Column,
     tally: Column,
@@ -557,16 +579,19 @@ def decode_evt2(
     triggers: TriggerColumns,
     filled: tuple[Integer, Integer],
 ) -> tuple[Integer, Integer, Integer, Integer]:
-    """Decode EVT2 words (uint32) until they or the columns' room run out; as `decode_evt3`."""
-    at, final = place
+    """Decode words of EVT2 or EVT2.1 (uint32) until they or the columns' room run out; as `decode_evt3`.
+
+    In EVT2.1 each word has a second one, whose bits mean events in this column and the next 31.
+    """
+    at, final, stride, head = place
     width, height = size_px
     t, x, y, p = events
     trigger_t, channel, value = triggers
     n, m = filled
     base, last, unconfirmed = state[BASE] + (state[HIGH] << 6), state[LAST], state[UNCONFIRMED]
     askew = int64(0)
-    i = 0
-    while i < len(words) and n < len(t) and m < len(trigger_t):
+    i = head
+    while i + stride - head <= len(words) and n + VECTOR_COLUMNS <= len(t) and m < len(trigger_t):
         w = int64(words[i])
         kind = w >> 28
         here = at + 4 * i
@@ -577,37 +602,42 @@ def decode_evt2(
             if state[BASE] < 0:
                 state[BASE], state[HIGH] = 0, w & 0xFFFFFFF
             else:
-                askew = _advance_time(words, i, at, int64(4), state, tally, final)
+                askew = _advance_time(words, i, at, int64(4), stride, state, tally, final)
                 if askew:
                     break
             base, unconfirmed = state[BASE] + (state[HIGH] << 6), state[UNCONFIRMED]
         elif state[BASE] < 0:
             _count_loss(tally, int64(BEFORE_TIME), here)
         elif kind <= EVT2_CD_ON or kind == EVT2_EXT_TRIGGER:
-            if unconfirmed:
-                _count_loss(tally, int64(TIME_DOUBTFUL), here)
-            elif kind <= EVT2_CD_ON and (column >= width or row >= height):
-                _count_loss(tally, int64(OUTSIDE_SENSOR), here)
-            elif clock < last:
-                _count_loss(tally, int64(TIME_BACKWARD), here)
-            elif kind <= EVT2_CD_ON:
-                t[n], x[n], y[n], p[n] = clock, column, row, kind
-                last = clock
-                n += 1
-            else:
-                trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0x1F, w & 1
-                last = clock
-                m += 1
+            is_event = kind <= EVT2_CD_ON
+            mask = int64(words[i + 1 - 2 * head]) if stride == 2 and is_event else int64(1)
+            while mask:
+                is_outside = is_event and (column >= width or row >= height)
+                loss = _find_loss(unconfirmed, is_outside, clock < last)
+                if not mask & 1:
+                    pass
+                elif loss >= 0:
+                    _count_loss(tally, loss, here)
+                elif is_event:
+                    t[n], x[n], y[n], p[n] = clock, column, row, kind
+                    last = clock
+                    n += 1
+                else:
+                    trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0x1F, w & 1
+                    last = clock
+                    m += 1
+                mask >>= 1
+                column += 1
         elif (EVT2_TYPES >> kind) & 1:
             _count_loss(tally, int64(OTHER_WORDS), here)
         else:
-            askew = _find_misalignment(words, i, at, int64(4), int64(EVT2_TYPES), int64(6), state, final)
+            askew = _find_misalignment(words, i, at, int64(4), stride, state, final)
             if askew:
                 break
             _count_loss(tally, int64(RESERVED), here)
-        i += 1
+        i += stride
     state[LAST] = last
-    return i, n, m, max(askew, int64(0))
+    return i - head, n, m, max(askew, int64(0))
 
 
 @njit

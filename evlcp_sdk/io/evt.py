@@ -1,7 +1,7 @@
-"""Encode events to words and decode them: EVT2, 32 bits an event; EVT3, 16 bits a change."""
+"""Events as words: EVT2, 32 bits an event; EVT2.1, 64 for 32 columns; EVT3, 16 a change."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -67,7 +67,9 @@ class Codec:
         name: Name after `% format`.
         version: Version after `% evt`.
         word: Type of a word, little-endian.
-        burst: Most events that one word may bring.
+        stride: Words that go together: 2 in EVT2.1, else 1.
+        head: Which of these has the type.
+        burst: Room for events without which decoding stops: those of one word.
         types: Bit mask of the word types that exist; a type is the top 4 bits of a word.
         channels: Trigger inputs that a word can name.
         time_bits: Bits of TIME_HIGH, and of the time below it.
@@ -86,6 +88,13 @@ class Codec:
     rollover: tuple[int, ...]
     decoder: Callable[..., Any]
     encoder: Callable[..., Any]
+    stride: int = 1
+    head: int = 0
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the words that go together."""
+        return self.word.itemsize * self.stride
 
     def encode_prelude(self, first_us: int) -> tuple[NDArray[Any], int]:
         """Return the words that set the clock before a first time, and the TIME_HIGH that they end with."""
@@ -94,7 +103,9 @@ class Codec:
         # A third of the range at a time: a longer step would read as one back.
         third = len(self.rollover) // 5
         partial = self.rollover[: third * (3 * step >> high)] if rollovers else ()
-        return np.array(self.rollover * rollovers + partial, self.word), (first_us >> low) - 1
+        words = np.zeros((len(self.rollover) * rollovers + len(partial), self.stride), self.word)
+        words[:, self.head] = self.rollover * rollovers + partial
+        return words.reshape(-1), (first_us >> low) - 1
 
 
 def encode_evt2(
@@ -129,11 +140,29 @@ def encode_evt2(
     return n, i + rows - done, j + done
 
 
+def encode_evt21(
+    words: NDArray[np.uint32],
+    state: NDArray[np.int64],
+    events: _kernels.EventColumns,
+    i: int,
+    triggers: _kernels.TriggerColumns,
+    j: int,
+) -> tuple[int, int, int]:
+    """Encode to EVT2.1 words of an IMX636 as `encode_evt2` does, an event or trigger a pair."""
+    heads = np.empty(len(words) // 2, words.dtype)
+    n, i, j = encode_evt2(heads, state, events, i, triggers, j)
+    pairs, heads = words[: 2 * n].reshape(n, 2), heads[:n]
+    is_event = heads >> 28 <= _kernels.EVT2_CD_ON
+    pairs[:, 0] = np.where(is_event, heads & ~np.uint32(0x1F << 11), heads)
+    pairs[:, 1] = np.where(is_event, np.uint32(1) << (heads >> 11 & 0x1F), 0)
+    return 2 * n, i, j
+
+
 EVT2: Final = Codec(
     name="EVT2",
     version="2.0",
     word=np.dtype("<u4"),
-    burst=1,
+    burst=_kernels.VECTOR_COLUMNS,
     types=_kernels.EVT2_TYPES,
     channels=32,
     time_bits=(28, 6),
@@ -142,6 +171,12 @@ EVT2: Final = Codec(
     encoder=encode_evt2,
 )
 """t = rollovers * 2^34 + TIME_HIGH * 2^6 + the event's own 6 bits, us."""
+
+EVT21: Final = replace(EVT2, name="EVT21", version="2.1", encoder=encode_evt21, stride=2)
+"""EVT2.1 as an IMX636 sends it: behind each word of EVT2 one with a bit for each column from there on."""
+
+EVT21_LITTLE: Final = replace(EVT21, head=1)
+"""EVT2.1 as a GenX320 sends it, one word of 64 bits: the columns come first. It is read only."""
 
 EVT3: Final = Codec(
     name="EVT3",
@@ -214,7 +249,7 @@ class Decoder:
         """
         used, out.events, out.triggers, askew = self.codec.decoder(
             words,
-            (at, final),
+            (at, final, self.codec.stride, self.codec.head),
             self._bounds,
             self._state,
             self._tally,

@@ -200,8 +200,8 @@ def open_writer(
         path: The file; its suffix is the format: `.raw`, `.mcap`, `.npz`, `.csv` or `.csv.gz`.
         width: Columns of the sensor; RAW and bags need it, tables do not.
         height: Rows of the sensor, likewise.
-        format: `EVT3` (the default for `.raw`), `EVT2`, `BAG` (of ROS 2, by the extra `ros`), `NPZ` or `CSV`,
-            whatever the file's name.
+        format: `EVT3` (the default for `.raw`), `EVT2`, `EVT21`, `BAG` (of ROS 2, by the extra `ros`), `NPZ`
+            or `CSV`, whatever the file's name.
         outputs: The files that appear together with it; None lets it appear as soon as it is closed.
         registry: The plugins to ask for other formats; None for all that are installed.
 
@@ -224,8 +224,8 @@ def open_writer(
             return writer
         found = f"format {format!r}" if format else f"suffix {suffix!r}"
         raise ConfigError(
-            f"{path}: {found}, expected {', '.join(WRITABLE)} or format EVT2, EVT3, NPZ, CSV, or one that a"
-            " plugin writes, as .mcap"
+            f"{path}: {found}, expected {', '.join(WRITABLE)} or format {', '.join(CODECS)}, NPZ, CSV, or one"
+            " that a plugin writes, as .mcap"
         )
     return RawWriter(path, width, height, CODECS[name], outputs)
 

@@ -1,4 +1,4 @@
-"""Prophesee RAW files: a header of text lines, then the words of EVT2 or EVT3."""
+"""Prophesee RAW files: a header of text lines, then the words of EVT2, EVT2.1 or EVT3."""
 
 import os
 import select
@@ -16,12 +16,15 @@ import numpy as np
 from evlcp_sdk.errors import ConfigError, InputError, RawFormatError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.io import _kernels
-from evlcp_sdk.io.evt import EVT2, EVT3, MAX_SIDE, Codec, Decoder, EventBuffer
+from evlcp_sdk.io.evt import EVT2, EVT3, EVT21, EVT21_LITTLE, MAX_SIDE, Codec, Decoder, EventBuffer
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.plugin.writer import EventWriter
 from evlcp_sdk.values import Events, Triggers, span_us, to_kernel_array
 
-CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}
+_ORDERS: Final = {"legacy": EVT21, "little": EVT21_LITTLE}
+"""EVT2.1 by its endianness; files that state none are of sensors older than the GenX320."""
+
+CODECS: Final = {codec.name: codec for codec in (EVT2, EVT21, EVT3)}
 """The encodings that can be read and written, by name."""
 
 MAX_HEADER_BYTES = 1 << 16
@@ -100,8 +103,8 @@ def parse_header(data: bytes, path: Path | str) -> RawHeader:
     space.
 
     Raises:
-        RawFormatError: There is no header, or it states no encoding or one that is not EVT2 or EVT3, or it
-            contradicts itself.
+        RawFormatError: There is no header, or it states no encoding or one that is not EVT2, EVT2.1 or EVT3,
+            or it contradicts itself.
     """
     if not data:
         raise RawFormatError(path, 0, "an empty file", "a RAW header, '% evt 3.0' or '% evt 2.0'")
@@ -141,9 +144,10 @@ def format_header(codec: Codec, width: int, height: int) -> bytes:
     % system_ID 49
     % end
     """
+    order = ";endianness=legacy" if codec is EVT21 else ""
     return (
         f"% evt {codec.version}\n"
-        f"% format {codec.name};height={height};width={width}\n"
+        f"% format {codec.name};height={height};width={width}{order}\n"
         f"% geometry {width}x{height}\n"
         "% integrator_name Prophesee\n"
         "% system_ID 49\n"
@@ -170,18 +174,24 @@ def _parse_fields(
     if "geometry" in fields:
         width, _, height = fields["geometry"].partition("x")
         sides += [("geometry", "width", width), ("geometry", "height", height)]
+    if "endianness" in fields:
+        sides.append(("endianness", "endianness", fields["endianness"]))
     versions = {codec.version: codec for codec in CODECS.values()}
     for key, text, known in (("format", name, CODECS), ("evt", fields.get("evt", ""), versions)):
         if key in fields:
             set_once("encoding", key, known.get(text), " or ".join(known))
+    if "encoding" not in found:
+        listed = ", ".join(fields)
+        raise RawFormatError(path, 0, f"a header without encoding ({listed})", "a line '% evt 3.0'")
+    codec = found["encoding"][1]
     for key, side, text in sides:
         if side in ("width", "height"):
             value = int(text) if text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_SIDE else None
             set_once(side, key, value, f"a width and a height from 1 to {MAX_SIDE}")
-    if "encoding" not in found:
-        listed = ", ".join(fields)
-        raise RawFormatError(path, 0, f"a header without encoding ({listed})", "a line '% evt 3.0'")
-    return found["encoding"][1], *(found.get(side, ("", None))[1] for side in ("width", "height"))
+        elif side == "endianness" and codec is EVT21:
+            set_once(side, key, _ORDERS.get(text), "endianness " + " or ".join(_ORDERS))
+    codec = found.get("endianness", ("", codec))[1]
+    return codec, *(found.get(side, ("", None))[1] for side in ("width", "height"))
 
 
 class RawSource(EventSource):
@@ -255,16 +265,17 @@ class RawSource(EventSource):
 
     def _check_encoding(self) -> None:
         """Raise a RawFormatError if the first words look like another encoding."""
-        words = self._get_words()[:RESERVED_PROBE_WORDS]
+        codec = self._codec
+        words = self._get_words()[codec.head :: codec.stride][:RESERVED_PROBE_WORDS]
         kinds = words >> (8 * words.itemsize - 4)
-        reserved = self._codec.types >> kinds.astype(np.int64) & 1 == 0
+        reserved = codec.types >> kinds.astype(np.int64) & 1 == 0
         share = np.count_nonzero(reserved) / max(len(words), 1)
         # If only later words are wrong, bytes are missing, which the decoder handles.
         first = reserved[:RESERVED_FIRST_WORDS].mean() if len(words) else 0.0
         if min(share, first) > RESERVED_SHARE and share * len(words) >= RESERVED_LEAST:
             raise RawFormatError(
                 self.path,
-                self._position + int(reserved.argmax()) * words.itemsize,
+                self._position + int(reserved.argmax()) * codec.size_bytes,
                 f"a word of a reserved type, as are {share:.0%} of the first {len(words)} words",
                 f"{self.format}, as the header says",
             )
@@ -288,7 +299,7 @@ class RawSource(EventSource):
             self._end += size or 0
 
     def _get_words(self) -> np.ndarray[tuple[int], np.dtype[np.unsignedinteger]]:
-        size = self._codec.word.itemsize
+        size = self._codec.size_bytes
         count = (self._end - self._start) // size
         return self._buffer[self._start : self._start + count * size].view(self._codec.word)
 
@@ -321,7 +332,7 @@ class RawSource(EventSource):
                 if self._is_pipe and not self._exhausted and (out.events or out.triggers):
                     return False
                 self._fill()
-            elif self._start % words.itemsize:
+            elif self._start % self._codec.size_bytes:
                 self._fill(0)
             if self._position - self._data_start > TIMELESS_BYTES and not self._decoder.has_time:
                 self._raise_timeless()
@@ -373,7 +384,7 @@ class RawEncoder:
 
 
 class RawWriter(EventWriter):
-    """Writes a RAW file in the words of a codec, `EVT3` or `EVT2`.
+    """Writes a RAW file in the words of a codec of `CODECS`.
 
     It reads back as it was written, in the same order; triggers at the time of events come first.
 

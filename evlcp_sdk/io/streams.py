@@ -23,9 +23,10 @@ _KERNEL_BYTES: Final = 1 << 22
 
 
 def _parse_encoding(text: str) -> str:
-    names = {"2": "EVT2", "3": "EVT3", "2.0": "EVT2", "3.0": "EVT3"} | {name.lower(): name for name in CODECS}
+    names = {"2": "EVT2", "3": "EVT3"}
+    names |= {key: codec.name for codec in CODECS.values() for key in (codec.version, codec.name.lower())}
     if text.lower() not in names:
-        raise ValueError("2 or 3")
+        raise ValueError("2, 2.1 or 3")
     return names[text.lower()]
 
 
@@ -81,8 +82,8 @@ class StreamSource(RawSource):
 def open_stream(url: str) -> EventSource:
     """Open RAW words from `tcp://HOST:PORT`, `udp://HOST:PORT` (listens there) or `unix:PATH`.
 
-    A stream without a RAW file's header takes the options `?evt=3` (the default of UDP) or `?evt=2`, and
-    `&size=1280x720`.
+    A stream without a RAW file's header takes the options `?evt=3` (the default of UDP), `?evt=2.1` or
+    `?evt=2`, and `&size=1280x720`.
 
     Raises:
         InputError: Nobody sends there, the name has another form, or the bytes are not RAW.

@@ -75,7 +75,7 @@ class EventSource(ABC):
 
     Args:
         path: The file, or the name of another source.
-        format: `EVT3`, `EVT2`, `NPZ`, `CSV` or another format's name.
+        format: `EVT3`, `EVT21`, `EVT2`, `NPZ`, `CSV` or another format's name.
         width: Columns of the sensor, or None if unknown.
         height: Rows of the sensor, or None.
         header: The recording's own header lines, by key.

@@ -125,12 +125,29 @@ def decode_evt3(data, width, height, start=0):
 
 
 def decode_evt2(data, width, height, start=0):
+    words = [word for (word,) in struct.iter_unpack("<I", data[: len(data) // 4 * 4])]
+    return _decode(words, [1] * len(words), range(start, start + len(data), 4), width, height)
+
+
+def decode_evt21(data, width, height, start=0):
+    """As an IMX636 has them: in bits of columns, 0 the lowest."""
+    words = list(struct.iter_unpack("<II", data[: len(data) // 8 * 8]))
+    heads, masks = [word for word, _ in words], [mask for _, mask in words]
+    return _decode(heads, masks, range(start, start + len(data), 8), width, height)
+
+
+def decode_evt21_little(data, width, height, start=0):
+    """As a GenX320 has them: 64 bits, the type in the highest four."""
+    words = [word for (word,) in struct.iter_unpack("<Q", data[: len(data) // 8 * 8])]
+    heads, masks = [word >> 32 for word in words], [word & 0xFFFFFFFF for word in words]
+    return _decode(heads, masks, range(start + 4, start + len(data), 8), width, height)
+
+
+def _decode(words, masks, places, width, height):
     out = Decoded()
     high = None
     doubt = False
-    words = [word for (word,) in struct.iter_unpack("<I", data[: len(data) // 4 * 4])]
-    for k, word in enumerate(words):
-        at = start + 4 * k
+    for k, (word, mask, at) in enumerate(zip(words, masks, places, strict=True)):
         kind = word >> 28
         if kind == 0x8:
             doubt = high is not None and doubtful(out, words, k, 28, 6, high, at)
@@ -140,10 +157,15 @@ def decode_evt2(data, width, height, start=0):
             out.lose("words_before_time", at)
             continue
         t = (out.rollovers - out.early) * 2**34 + high * 64 + (word >> 22 & 0x3F)
-        if doubt and kind in (0x0, 0x1, 0xA):
-            out.lose("time_doubtful", at)
+        columns = [word >> 11 & 0x7FF] if kind == 0xA else []
+        if kind in (0x0, 0x1):
+            columns = [(word >> 11 & 0x7FF) + bit for bit in range(32) if mask >> bit & 1]
+        if doubt and columns:
+            for _ in columns:
+                out.lose("time_doubtful", at)
         elif kind in (0x0, 0x1):
-            out.add_event(t, word >> 11 & 0x7FF, word & 0x7FF, kind, at, width, height)
+            for x in columns:
+                out.add_event(t, x, word & 0x7FF, kind, at, width, height)
         elif kind == 0xA:
             out.add(out.triggers, (t, word >> 8 & 0x1F, word & 1), at)
         elif kind not in (0xE, 0xF):
@@ -151,4 +173,4 @@ def decode_evt2(data, width, height, start=0):
     return out
 
 
-TWINS = {"EVT3": decode_evt3, "EVT2": decode_evt2}
+TWINS = {"EVT3": decode_evt3, "EVT2": decode_evt2, "EVT21": decode_evt21, "little": decode_evt21_little}

@@ -13,6 +13,7 @@ import pytest
 
 from evlcp_sdk.errors import InputError, RawFormatError
 from evlcp_sdk.io import RawSource, open_source, write_events
+from evlcp_sdk.io.evt import EVT3, EVT21, EVT21_LITTLE
 from evlcp_sdk.io.raw import CODECS, format_header, parse_header
 from evlcp_sdk.values import Events
 
@@ -35,7 +36,7 @@ BAD_HEADERS = {
     "empty file": (b"", 0, "an empty file", "a RAW header"),
     "PNG": (b"\x89PNG\r\n\x1a\n" + bytes(50), 0, "89 50 4e 47", "'% '"),
     "no encoding": (b"% date today\n% end\n", 0, "a header without encoding", "'% evt 3.0'"),
-    "EVT4": (b"% date x\n% format EVT4;height=1;width=1\n% end\n", 9, "'% format EVT4;", "EVT2 or EVT3"),
+    "EVT4": (b"% date x\n% format EVT4;height=1;width=1\n% end\n", 9, "'% format EVT4;", "EVT21 or EVT3"),
     "two encodings": (b"% evt 2.0\n% format EVT3\n% end\n", 0, "'% evt 2.0' beside '% format EVT3'", "one"),
     "two sizes": (
         b"% format EVT3;height=4;width=5\n% geometry 6x4\n% end\n",
@@ -43,6 +44,13 @@ BAD_HEADERS = {
     ),
     "a line twice": (b"% geometry 4x4\n% geometry 5x4\n% end\n", 15, "a second", "'% geometry 4x4'"),
     "zero width": (b"% evt 3.0\n% geometry 0x4\n% end\n", 10, "'% geometry 0x4'", "from 1 to 2048"),
+    "big-endian": (b"% evt 2.1\n% endianness big\n% end\n", 10, "'% endianness big'", "legacy or little"),
+    "two orders": (
+        b"% format EVT21;endianness=little\n% endianness legacy\n% end\n",
+        33,
+        "beside",
+        "one end",
+    ),
     "huge width": (b"% format EVT3;height=720;width=99999\n% end\n", 0, "width=99999", "from 1 to 2048"),
     "binary in the header": (b"% evt 3.0\n% \xff\x00\n% end\n", 10, r"b'% \xff", "a header line"),
     "header cut": (b"% evt 3.0\n% forma", 10, "b'% forma'", "ended by a line feed"),
@@ -79,6 +87,14 @@ def test_header_lines_of_a_real_camera():
     assert header.fields == {"evt": "3.0", "date": date, "geometry": "1280x720", "plugin": ""}
     assert (header.codec.name, header.width, header.height) == ("EVT3", 1280, 720)
     assert (header.size_bytes, header.closed) == (len(lines) - 2, True)
+
+
+def test_the_order_of_evt21_is_what_the_header_says():
+    stated = {b"": EVT21, b"% endianness legacy\n": EVT21, b"% endianness little\n": EVT21_LITTLE}
+    stated |= {b"% format EVT21;height=9;endianness=little\n": EVT21_LITTLE}
+    for line, codec in stated.items():
+        assert parse_header(line + b"% evt 2.1\n% end\n", "a.raw").codec is codec
+    assert parse_header(b"% evt 3.0\n% endianness little\n% end\n", "a.raw").codec is EVT3
 
 
 @pytest.mark.parametrize(("written", "declared"), [("EVT2", "EVT3"), ("EVT3", "EVT2")])

@@ -120,7 +120,7 @@ def test_a_read_ends_when_the_source_is_closed(recording):
         ("udp://localhost:99999", "expected udp://HOST:PORT"),
         ("udp://192.0.2.1:5600", "expected an address of this machine"),
         ("unix:/no/such", "expected a socket that a program listens on"),
-        ("tcp://localhost:1?evt=4", "evt = '4': expected 2 or 3"),
+        ("tcp://localhost:1?evt=4", "evt = '4': expected 2, 2.1 or 3"),
     ],
 )
 def test_what_is_wrong_with_a_stream_is_reported(url, message):
