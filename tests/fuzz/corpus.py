@@ -156,7 +156,7 @@ def kinds(folder, store):
     np.save(masks, np.zeros((packet.packet_chips, 16), np.uint8))
     return [
         Kind("EVT3", "a.raw", _recording(folder, "3.raw"), read_recording),
-        Kind("EVT2", "a.raw", _recording(folder, "2.raw", "EVT2"), read_recording),
+        *(Kind(name, "a.raw", _recording(folder, name, name), read_recording) for name in ("EVT2", "EVT21")),
         Kind("NPZ", "a.npz", _recording(folder, "a.npz"), read_recording),
         Kind("CSV", "a.csv", _recording(folder, "a.csv"), read_recording),
         Kind("CSV in gzip", "a.csv.gz", _recording(folder, "a.csv.gz"), read_recording),

@@ -22,12 +22,12 @@ from tests.fuzz.mutate import damage
 from tests.unit.study.fake import fake_plan, run_fake
 
 NAMES = (
-    *("EVT3", "EVT2", "NPZ", "CSV", "CSV in gzip", "NPY", "HDF5", "MAT 7.3", "MAT", "MCAP", "db3", "NMEA"),
-    *("update", "truth", "frames.csv", "summary.json", "poses", "attitude", "sites", "link", "scene"),
+    *("EVT3", "EVT2", "EVT21", "NPZ", "CSV", "CSV in gzip", "NPY", "HDF5", "MAT 7.3", "MAT", "MCAP", "db3"),
+    *("NMEA", "update", "truth", "frames.csv", "summary.json", "poses", "attitude", "sites", "link", "scene"),
     *("campaign", "results", "symbols", "masks", "inventory"),
 )
 
-ROUNDS = {"campaign": 10, "EVT3": 150, "EVT2": 150}
+ROUNDS = {"campaign": 10, "EVT3": 150, "EVT2": 150, "EVT21": 150}
 """Damaged files of a kind; 40 of others. `make fuzz` reads more."""
 
 
@@ -86,11 +86,11 @@ def test_no_kernel_reads_or_writes_beside_its_arrays(corpus, tmp_path):
         "path, *good = (pathlib.Path(a) for a in sys.argv[1:])\n"
         "rng = random.Random(5)\n"
         "for n in range(60):\n"
-        "    path.write_bytes(damage(good[n % 2].read_bytes(), rng))\n"
+        "    path.write_bytes(damage(good[n % 3].read_bytes(), rng))\n"
         "    try: read_recording(path)\n"
         "    except EvlcpError: pass\n"
     )
-    good = [tmp_path / f"{name}.raw" for name in ("EVT3", "EVT2")]
+    good = [tmp_path / f"{name}.raw" for name in ("EVT3", "EVT2", "EVT21")]
     for path in good:
         path.write_bytes(corpus[path.stem].data)
     # What is compiled is not kept, and need not be fast.
