@@ -112,6 +112,9 @@ def _create_dispatcher(function: Callable[..., Any], options: dict[str, Any]) ->
     import numba
 
     kernel = numba.njit(**options)(function)
+    if kernel is function:
+        # NUMBA_DISABLE_JIT=1: kernels are debugged as Python.
+        return function
     # RuntimeError: Numba finds no folder.
     with suppress(RuntimeError):
         kernel.enable_caching()

@@ -49,6 +49,7 @@ def test_a_kernel_is_compiled_once_and_kept(tmp_path: Path) -> None:
     assert out[0] == "42 2 0"
     # To load it, which many processes at once make slow, too, is nothing to tell.
     assert err == ""
+    assert run(tmp_path, {"NUMBA_DISABLE_JIT": "1"})[0][0] == "42 0 0"
 
 
 def test_what_is_kept_of_a_type_that_is_gone_is_forgotten(tmp_path: Path) -> None:
