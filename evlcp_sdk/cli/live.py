@@ -18,6 +18,7 @@ from evlcp_sdk.cli._receiving import CameraOptions, Cores, LinkOptions, PlaceOpt
 from evlcp_sdk.cli._stderr import print_stderr
 from evlcp_sdk.cli._summary import format_delays, print_end
 from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.signals import stop_on_request
 
 _HERE = "127.0.0.1"
@@ -192,17 +193,18 @@ def _exit_code(summary: dict[str, Any], interrupted: Path | None) -> int:
 def _show_status(publisher: sdk.publisher.Publisher, *, silent: bool) -> Iterator[None]:
     """Show the status in a line on stderr, on a terminal only, and not between lines of JSON."""
     from rich.live import Live
+    from rich.text import Text
 
     err = console(stderr=True)
     if silent or not err.is_interactive:
         yield
         return
-    subscription, text = publisher.subscribe({"status"}, most=1), ""
+    # Too long a line goes on in the next: what is lost stands last.
+    subscription, text = publisher.subscribe({"status"}, most=1), Text(overflow="fold", no_wrap=False)
 
-    def draw() -> str:
-        nonlocal text
+    def draw() -> Text:
         for news in subscription.take(0):
-            text = format_status(news.value)
+            text.plain = format_status(news.value)
         return text
 
     with Live(console=err, transient=True, get_renderable=draw):
@@ -213,9 +215,9 @@ def format_status(status: sdk.loop.LiveStatus) -> str:
     """The status of a live run, in a line."""
     text = f"{status.elapsed_s:.0f} s, {status.events_per_s / 1e6:.1f} Mev/s"
     if frames := status.counts.get("frames", 0):
-        text += f", {frames} frames"
+        text += f", {format_count(frames, 'frame')}"
     if messages := status.counts.get("messages", 0):
-        text += f", {messages} messages"
+        text += f", {format_count(messages, 'message')}"
     if (recent := status.recent["total"])["count"]:
         text += f", delay {format_delays(recent)}"
     if lost := sum(loss.count for loss in status.losses.values()):

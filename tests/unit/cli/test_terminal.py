@@ -25,7 +25,7 @@ TITLE = "\x1b]0;mine\x07\x9b31m\u202e"
 COMMAND = "from evlcp_sdk.cli.main import main; main()"
 
 
-def on_a_terminal(*arguments: str) -> str:
+def on_a_terminal(*arguments: str, **environment: str) -> str:
     """Run a command on a terminal without colours; all that it shows."""
     inside, outside = pty.openpty()
     run = subprocess.Popen(
@@ -33,7 +33,7 @@ def on_a_terminal(*arguments: str) -> str:
         stdin=subprocess.DEVNULL,
         stdout=outside,
         stderr=outside,
-        env=os.environ | {"TERM": "dumb", "NO_COLOR": "1", "PYTHONUTF8": "1"},
+        env=os.environ | {"TERM": "dumb", "NO_COLOR": "1", "PYTHONUTF8": "1"} | environment,
     )
     os.close(outside)
     shown = b""
@@ -67,6 +67,12 @@ def test_no_control_character_reaches_a_terminal(what: str, tmp_path: Path) -> N
     assert r"\x1b" in shown
     assert not {c for c in shown if c not in "\r\n\t" and (ord(c) < 0x20 or 0x7F <= ord(c) < 0xA0)}, shown
     assert "\u202e" not in shown
+
+
+def test_the_status_of_a_live_run_is_shown_whole(demo_raw: Path, tmp_path: Path) -> None:
+    arguments = ("live", f"replay:{demo_raw}?speed=0.1", "-o", str(tmp_path))
+    shown = " ".join(on_a_terminal(*arguments, TERM="xterm", COLUMNS="30").split())
+    assert re.search(r"Mev/s, \d+ frames?, delay p50 \S+, p99 \S+, max \S+ ms", shown)
 
 
 def test_commands_print_by_the_one_way_only() -> None:
