@@ -141,6 +141,8 @@ def _build_link(
         if not (equals and key) or (dot and not table):
             raise ConfigError(f"--set {override}: expected KEY=VALUE or TABLE.KEY=VALUE")
         if not dot or table == role:
+            if key == "id":
+                raise ConfigError(f"--set {override}: the algorithm is {role} {id}, as given")
             own[key] = sdk.specs.parse_value(value)
         else:
             rest.append(override)

@@ -94,6 +94,7 @@ def test_the_command_says_one_line_a_law(evlcp):
         (("rangin", "poc"), "no role named 'rangin' (known: detection,"),
         (("ranging", "poc", "--set", "foo=3"), "ranging.foo = 3: unknown key"),
         (("ranging", "poc", "--set", "foo"), "--set foo: expected KEY=VALUE or TABLE.KEY=VALUE"),
+        (("ranging", "poc", "--set", "ranging.id=none"), "the algorithm is ranging poc, as given"),
         (("ranging", "poc", "--excuse", "exact"), "expected LAW=REASON"),
         (("ranging",), "check ranging: expected ROLE and ID, or neither for a whole link"),
         (("--excuse", "exact=no"), "--excuse: expected ROLE and ID"),
@@ -126,6 +127,8 @@ def test_a_whole_link(evlcp, monkeypatch):
     table = json.loads(evlcp("check", "--set", "modulation.id=wh8", "--json").out)
     assert (table["failed"], len(table["laws"])) == (1, len(shown) // 2)
     assert {law["id"] for law in table["laws"] if law["role"] == "link"} == {None}
+    # Another framing, with a bar that suits it.
+    assert "framing 'uart' of evlcp-sdk" in evlcp("check", "framing", "uart").out
 
 
 @dataclass(frozen=True)
