@@ -148,8 +148,6 @@ def _print_frames(file: Path) -> None:
     rows = []
     with file.open(newline="") as lines:
         for row in csv.DictReader(lines):
-            if row["echo_of"]:
-                continue
             distance_m, sigma_m = row["distance_m"], row["distance_sigma_m"]
             sigma = f"{float(sigma_m):.2f}" if sigma_m else "?"
             rows.append(
