@@ -169,7 +169,7 @@ def test_what_became_of_positions_is_a_table_of_its_own(summary: Summary, tmp_pa
     plan = Plan("p", scenes, (Case({}, 0, {}),), (0,))
     fixes = [Tally.of_fix(0.1, 2.0, protected=True), Tally.of_fix(0.3, 20.0, excluded=True)]
     tallies = {
-        "right": [*fixes, Tally.of_track_point(0.2, 3.0, 0.1, 6.0)],
+        "right": [*fixes, Tally.of_track_point(0.2, 3.0, 0.1, 6.0), Tally(messages_sent=4, messages_found=3)],
         "off": [Tally(fixes_refused=3, fixes_contradicted=2)],
     }
 
@@ -186,3 +186,4 @@ def test_what_became_of_positions_is_a_table_of_its_own(summary: Summary, tmp_pa
     assert off[1:5] == ("0 of 3", "2", "0.0%", "0")
     assert "<h2>Positions</h2>" in render_campaign(found)
     assert "| right | 2 of 2 | 0 | 100.0% |" in to_markdown(found)
+    assert "| 3 of 4 | 0 | 2 of 2 |" in to_markdown(found)

@@ -348,6 +348,18 @@ def positions_beside(strange: list[int], unseen: list[int]) -> dict[str, Any]:
         ("focal", learnt("camera", "focal_mm", 0.05, 0.02), ""),
         ("learnt", learnt("bar 2", "east_m", 0.4, 0.02), ""),
         ("learnt", learnt("bar 2", "east_m", -0.9, 0.02), "shows bar 2, east_m, -0.9 off what is stated,"),
+        ("excluded", {"fixes": 2, "excluded": {"heading": 2}}, "2 positions without heading, which the rest"),
+        (
+            "excluded",
+            {"fixes": 2, "excluded": {"bar 1": 1}, "focal_mm_fits": 34.6},
+            "1 position without bar 1, which the rest contradicts: compare camera.focal_mm = 35: about 34.6"
+            " would fit; or its place, angles and length",
+        ),
+        ("attitude-outside", {"fixes": 1, "attitude_outside": 9}, "none of the attitude's 9 lines is within"),
+        ("attitude-missing", {"fixes": 5, "attitude_missing": 2}, "2 of 5 positions have no attitude"),
+        ("gnss-outside", {"gnss_outside": 3}, "none of 3 GNSS fixes is within the recording's time"),
+        ("gnss-outside", {"fixes": 1, "gnss_outside": 3, "gnss": 1}, ""),
+        ("gnss-without-heading", {"fixes": 1, "gnss_without_heading": 1}, "1 GNSS fix not used, as no heading"),
     ],
 )
 def test_what_positions_say(code: str, positions: dict[str, Any], message: str) -> None:

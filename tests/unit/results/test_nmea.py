@@ -89,6 +89,8 @@ def test_clients_are_answered() -> None:
     answer_request('?WATCH={"enable":true,"nmea":true}', watch, {})
     assert watch["nmea"]
     assert answer_request("?VERSION;", watch, {})[0]["proto_major"] == 3
+    (device,) = answer_request("?DEVICE;", watch, {})
+    assert answer_request("?DEVICES;", watch, {}) == [{"class": "DEVICES", "devices": [device]}]
     assert answer_request("?POLL;", watch, {})[0]["active"] == 0
     assert answer_request("?POLL;", watch, {"TPV": {"mode": 3}})[0]["tpv"] == [{"mode": 3}]
     for fault in ("?WATCH={", "?WATCH=[1]", "hello", "?\x00"):

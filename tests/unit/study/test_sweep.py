@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -41,7 +42,7 @@ def campaign(tmp_path: Path) -> Path:
     return path
 
 
-def test_from_a_file_to_figures(evlcp, campaign: Path, tmp_path: Path) -> None:
+def test_from_a_file_to_figures(evlcp, campaign: Path, tmp_path: Path, monkeypatch) -> None:
     results = tmp_path / "r.sqlite"
     dry = evlcp("sweep", campaign, "-o", results, "--dry-run")
     assert (dry.code, "short: 0 of 4 tasks" in dry.out, results.exists()) == (0, True, False)
@@ -66,6 +67,11 @@ def test_from_a_file_to_figures(evlcp, campaign: Path, tmp_path: Path) -> None:
     table = json.loads(evlcp("report", results, "--json").out)
     assert [s["name"] for s in table["series"]] == ["16 clusters", "two clusters"]
     assert "| 16 clusters |" in evlcp("report", results, "--markdown").out
+
+    monkeypatch.setattr("evlcp_sdk.study.collect.collect_results", Mock(side_effect=KeyboardInterrupt))
+    done = evlcp("sweep", campaign, "-o", results)
+    expected = f"evlcp: interrupted; 4 of 4 tasks are in {results}; the same command goes on\n"
+    assert (done.code, done.err) == (130, expected)
 
 
 @pytest.mark.parametrize(
@@ -113,6 +119,15 @@ def test_files_of_a_scene_count_by_what_they_hold(campaign: Path, tmp_path: Path
     assert ids() == before
     (tmp_path / "path.csv").write_text("t_s,x_m\n0,1\n")
     assert ids() != before
+
+
+def test_messages_and_positions_of_a_campaign_are_counted(campaign: Path) -> None:
+    campaign.write_text(CAMPAIGN.replace('"drive-30kmh"', f'"{ROOT}/examples/scenes/gate.toml"'))
+    (_, found), _ = run_job(plan_campaign(campaign, ["scene.motion.distance_m=40"]).jobs[0])
+    total = found.total()
+    assert total.messages_found == total.messages_sent > 0
+    assert (total.fixes > 0, total.fixes_refused, total.messages_wrong) == (True, 0, 0)
+    assert total.position_95_m < 0.1
 
 
 def test_the_shipped_campaigns_are_read() -> None:
