@@ -158,5 +158,4 @@ def _print_frames(file: Path) -> None:
                     f"{float(distance_m):.2f} ± {sigma}" if distance_m else "-",
                 )
             )
-    head = ("frame", "ms", "symbols of clusters 0 to 15", "distance, m")
-    print_table(console(), head, rows, names=0)
+    print_table(console(), ("frame", "ms", "symbols of clusters 0 to 15", "distance, m"), rows, names=0)

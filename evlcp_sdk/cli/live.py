@@ -214,10 +214,9 @@ def _show_status(publisher: sdk.publisher.Publisher, *, silent: bool) -> Iterato
 def format_status(status: sdk.loop.LiveStatus) -> str:
     """The status of a live run, in a line."""
     text = f"{status.elapsed_s:.0f} s, {status.events_per_s / 1e6:.1f} Mev/s"
-    if frames := status.counts.get("frames", 0):
-        text += f", {format_count(frames, 'frame')}"
-    if messages := status.counts.get("messages", 0):
-        text += f", {format_count(messages, 'message')}"
+    for noun in ("frame", "message"):
+        if number := status.counts.get(f"{noun}s", 0):
+            text += f", {format_count(number, noun)}"
     if (recent := status.recent["total"])["count"]:
         text += f", delay {format_delays(recent)}"
     if lost := sum(loss.count for loss in status.losses.values()):
