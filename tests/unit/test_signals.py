@@ -30,11 +30,12 @@ def start(*arguments: str | Path, alone: bool = False) -> subprocess.Popen[str]:
     return subprocess.Popen(command, **pipes, text=True, preexec_fn=hear_all, start_new_session=alone)
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
 def test_a_run_that_is_asked_to_end_keeps_what_it_has(number, demo_raw, tmp_path) -> None:
-    pipe, out = tmp_path / "live.raw", tmp_path / "out"
+    """And begins no other recording."""
+    pipe, out = tmp_path / "live.raw", tmp_path / "out" / "live"
     os.mkfifo(pipe)
-    process = start("receive", pipe, "-o", out)
+    process = start("receive", pipe, demo_raw, "-o", out.parent)
     data = demo_raw.read_bytes()
     with pipe.open("wb", buffering=0) as file:
         # A pipe holds less than this: the receiver has begun.
@@ -52,6 +53,7 @@ def test_a_run_that_is_asked_to_end_keeps_what_it_has(number, demo_raw, tmp_path
     assert summary["status"] == "interrupted"
     assert summary["transmitters"][0]["frames_found"] > 0
     assert {p.name for p in out.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
+    assert list(out.parent.iterdir()) == [out]
 
 
 def test_a_simulation_that_is_asked_to_end_leaves_nothing(tmp_path: Path) -> None:
@@ -66,6 +68,7 @@ def test_a_simulation_that_is_asked_to_end_leaves_nothing(tmp_path: Path) -> Non
 
 
 def test_a_request_ends_a_wait_and_nothing_else() -> None:
+    before = signal.getsignal(signal.SIGTERM)
     with stop_on_request() as stopped:
         also = stopped.or_when(lambda: False)
         with waiting(also):
@@ -76,6 +79,7 @@ def test_a_request_ends_a_wait_and_nothing_else() -> None:
         # It was asked before: what would be waited for may never come.
         with pytest.raises(KeyboardInterrupt), waiting(also):
             pytest.fail("it waits")
+    assert signal.getsignal(signal.SIGTERM) is before
     with stop_on_request() as stopped:
         with pytest.raises(KeyboardInterrupt), waiting(stopped):
             signal.raise_signal(signal.SIGTERM)

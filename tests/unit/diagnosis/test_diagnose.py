@@ -277,16 +277,6 @@ def test_links_are_inferred_and_ranked() -> None:
         assert infer_link(source, LINK)[0].changes == ()
 
 
-def write_recording(folder: Path, link: tuple[str, ...] = (), *, turned: bool = False) -> Path:
-    """A recording, on request upside down."""
-    with render(link) as source:
-        events, _ = source.read()
-    if turned:
-        events = Events(events.t_us, 1279 - events.x, 719 - events.y, events.p)
-    write_events(folder / "sent.raw", events, 1280, 720)
-    return folder / "sent.raw"
-
-
 def run(*args: Any) -> Result:
     done = CliRunner().invoke(make_app(), [str(one) for one in args])
     assert done.exit_code == 0, done.output
@@ -294,7 +284,11 @@ def run(*args: Any) -> Result:
 
 
 def test_picture_upside_down_is_noticed(tmp_path: Path) -> None:
-    diagnosis = diagnose(write_recording(tmp_path, turned=True), LINK)
+    with render() as source:
+        events, _ = source.read()
+    turned = Events(events.t_us, 1279 - events.x, 719 - events.y, events.p)
+    write_events(tmp_path / "sent.raw", turned, 1280, 720)
+    diagnosis = diagnose(tmp_path / "sent.raw", LINK)
     assert code_of(diagnosis) == "turned"
     assert diagnosis.counts["frames_rejected"] == 0
 
@@ -315,7 +309,8 @@ def test_a_recording_without_events_fails_once(tmp_path: Path) -> None:
 
 
 def test_command_says_it_in_words_as_json_and_on_a_page(tmp_path: Path) -> None:
-    recording, page = write_recording(tmp_path, ("air.chip_rate_hz=8000",)), tmp_path / "slow.html"
+    recording, page = tmp_path / "sent.raw", tmp_path / "slow.html"
+    render(("air.chip_rate_hz=8000",)).save(recording)
     shown = run("diagnose", recording, "-o", page).stdout
     assert "blinks at 8 kHz, the link says 10 kHz" in shown
     assert "next: --set air.chip_rate_hz=8000" in shown
@@ -331,9 +326,8 @@ def test_command_says_it_in_words_as_json_and_on_a_page(tmp_path: Path) -> None:
 
 
 def test_receive_takes_the_link_that_fits(tmp_path: Path) -> None:
-    reported = run(
-        "receive", write_recording(tmp_path, ("modulation.id=wh8",)), "-o", tmp_path / "out", "--link", "auto"
-    )
+    render(("modulation.id=wh8",)).save(tmp_path / "sent.raw")
+    reported = run("receive", tmp_path / "sent.raw", "-o", tmp_path / "out", "--link", "auto")
     assert "link --set modulation.id=wh8" in reported.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["codebook"]["profile"] == "wh8"

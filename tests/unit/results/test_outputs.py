@@ -101,27 +101,28 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
         "distance_median_m": 50.0,
     }
     assert {second[k] for k in ("quality", "clock_ppm", "distance_median_m")} == {None}
+    short = load_link(overrides=["air.frames_per_packet=2"])
+    assert "expected at least 18" in result(tmp_path / "short", link=short)["messages_off"]
 
 
-def test_packets_too_short_for_messages_are_reported(tmp_path: Path) -> None:
-    table = result(tmp_path, link=load_link(overrides=["air.frames_per_packet=2"]))
-    assert "expected at least 18" in table["messages_off"]
-
-
-def test_a_symbol_that_is_not_given_is_a_dash_and_null(tmp_path: Path) -> None:
+def test_a_symbol_that_is_not_given_and_a_filtered_distance_in_all_files(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
     one = frame(0, 0)
     symbols = one.soft.symbols.copy()
     symbols[[0, 5]] = -1
     hidden = replace(one, soft=replace(one.soft, symbols=symbols))
-    result(tmp_path, packet(0, hidden), sinks=["parquet"])
-    (row,), (line,) = rows_of(tmp_path / "frames.csv"), lines_of(tmp_path)
+    link = load_link(overrides=["modulation.id=wh8", "air.frames_per_packet=3", "tracking.id=kalman"])
+    result(tmp_path, packet(0, hidden, frame(0, 1, math.nan)), link=link, sinks=["parquet"])
+    (row, other), (line,) = rows_of(tmp_path / "frames.csv"), lines_of(tmp_path)
     assert row["symbols"] == "- 1 2 3 4 - 6 7 8 9 10 11 12 13 14 15"
     assert line["symbols"][0] == [None, 1, 2, 3, 4, None, *range(6, 16)]
     assert line["bits"][:24] == "????" + "0001" + "0010" + "0011" + "0100" + "????"
     assert line["bits"][24:64] == "".join(f"{symbol:04b}" for symbol in range(6, 16))
-    (row,) = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
+    assert (row["distance_filtered_m"], row["distance_filtered_sigma_m"]) == ("51.0000", "0.0250")
+    assert (other["distance_filtered_m"], other["distance_filtered_sigma_m"]) == ("", "")
+    row, other = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
     assert row["symbols"] == line["symbols"][0]
+    assert (row["distance_filtered_m"], other["distance_filtered_m"]) == (51.0, None)
 
 
 def test_a_reflection_is_named_as_one(tmp_path: Path) -> None:
@@ -177,19 +178,6 @@ def test_the_median_needs_no_memory_of_every_frame() -> None:
     assert tally.median_m() == pytest.approx(np.median(distances), abs=0.006)
     tally.add(packet(333, frame(333, 0, 1e300)))
     assert max(tally.distance_cells) == 100_000
-
-
-def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
-    link = load_link(overrides=["tracking.id=kalman"])
-    result(tmp_path, packet(0, frame(0, 0), frame(0, 1, math.nan)), link=link, sinks=["parquet"])
-    reported = [
-        (row["distance_filtered_m"], row["distance_filtered_sigma_m"])
-        for row in rows_of(tmp_path / "frames.csv")
-    ]
-    assert reported == [("51.0000", "0.0250"), ("", "")]
-    table = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
-    assert [row["distance_filtered_m"] for row in table] == [51.0, None]
 
 
 def test_a_line_has_all_columns() -> None:

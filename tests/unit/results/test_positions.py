@@ -23,7 +23,7 @@ from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place import navigator
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.gnss import GnssLog, geoid_m
-from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
+from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan, Settled
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.trajectory import step_trajectory
 from evlcp_sdk.plugin.registry import Registry
@@ -34,7 +34,7 @@ from evlcp_sdk.results.nmea import Nmea
 from evlcp_sdk.results.position_tables import AlternativesCsv, FixesCsv, PointsCsv
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.summary import RunEnd
-from evlcp_sdk.results.trail import split_at_antimeridian
+from evlcp_sdk.results.trail import Trail, split_at_antimeridian
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
@@ -299,6 +299,16 @@ def test_a_track_across_the_180th_meridian_is_cut() -> None:
         one, two = split_at_antimeridian(way)
         assert one == [way[0], pytest.approx([sign * 180, 35.1, 2.0])]
         assert two == [pytest.approx([sign * -180, 35.1, 2.0]), way[1], way[2]]
+
+
+def test_a_track_that_begins_anew_is_another_line() -> None:
+    places = [
+        Place(n, 35.0 + n, 137.0, 5.0, np.zeros(3), np.eye(3), 0.0, 0.0, False, starts=n in (0, 3))
+        for n in range(6)
+    ]
+    settled, trail = [Settled(Fix.from_refusal(0.0, (), "", ""), one, one) for one in places], Trail()
+    lines = [line for part in (settled[:2], settled[2:5], settled[5:]) for line in trail.lines(part)]
+    assert [[point[1] - 35 for point in line] for line in lines] == [[0, 1], [1, 2], [3, 4], [4, 5]]
 
 
 def test_points_of_frames(tmp_path: Path) -> None:

@@ -74,19 +74,10 @@ def test_from_a_file_to_figures(evlcp, campaign: Path, tmp_path: Path, monkeypat
     assert (done.code, done.err) == (130, expected)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["scene.bars.z_m=-100"], "the bar is behind the camera"),
-        (["seeds=0"], "--set seeds=0: expected campaign.KEY="),
-    ],
-)
-def test_bad_campaigns_are_one_line(evlcp, campaign, tmp_path, overrides, message) -> None:
-    options = [part for text in overrides for part in ("--set", text)]
-    done = evlcp("sweep", campaign, "-o", tmp_path / "r.sqlite", *options)
-    assert done.code == 2
-    assert message in done.err
-    assert len(done.err.splitlines()) <= 2
+def test_a_bad_campaign_is_one_line(evlcp, campaign: Path, tmp_path: Path) -> None:
+    done = evlcp("sweep", campaign, "-o", tmp_path / "r.sqlite", "--set", "seeds=0")
+    assert (done.code, len(done.err.splitlines())) == (2, 1)
+    assert "--set seeds=0: expected campaign.KEY=" in done.err
     assert not (tmp_path / "r.sqlite").exists()
 
 
