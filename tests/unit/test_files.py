@@ -81,10 +81,7 @@ def test_a_file_that_was_committed_before_the_end_of_the_block_stays(tmp_path: P
         outputs.commit()
         assert (tmp_path / "a").read_text() == "one"
         outputs.write_text("two", tmp_path / "b")
-    assert [(path.name, path.read_text()) for path in sorted(tmp_path.iterdir())] == [
-        ("a", "one"),
-        ("b", "two"),
-    ]
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": "one", "b": "two"}
 
 
 def test_hidden_places_cannot_be_known_before(tmp_path: Path) -> None:

@@ -95,7 +95,6 @@ def test_text_and_files(evlcp: Evlcp, recording: Path, tmp_path: Path) -> None:
     ("arguments", "code", "message"),
     [
         ((), 2, "name at least one"),
-        (("--variant", "a:ranging.id=pco"), 2, "--variant a: no ranging algorithm named 'pco'"),
         (("--variant", "a:", "-o", "t.pdf"), 2, ".csv, .html"),
         (("--variant", "a:", "-o", "none/t.csv"), 1, "none/t.csv: cannot be written: no folder none"),
         (("REC.raw", "--variant", "a:"), 2, "REC.raw is named twice"),

@@ -84,6 +84,5 @@ def test_many_regions_and_transmitters_keep_a_bounded_share(figures: Figures) ->
     assert (len(figures.regions), figures.region_count) == (64, 300)
     show(figures, 40, 2)
     assert (sorted(figures.transmitters), sorted(figures.clearest)) == ([*range(6)], [*range(3)])
-    assert f"{figures.region_count} regions, 64 shown" in draw_regions(figures, "many").axes[0].get_title(
-        "left"
-    )
+    title = draw_regions(figures, "many").axes[0].get_title("left")
+    assert f"{figures.region_count} regions, 64 shown" in title

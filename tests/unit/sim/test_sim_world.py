@@ -92,15 +92,6 @@ def test_an_imu_tells_the_attitude_and_one_error() -> None:
     np.testing.assert_allclose(np.std(errors, 0), 0.1, rtol=0.36)
 
 
-@pytest.mark.parametrize("known", ["none", "gravity", "heading"])
-def test_what_an_imu_does_not_know(known: str) -> None:
-    scene = load_scene("drive-30kmh", {"duration_s": 0.05, "world.attitude": known})
-    log = attitude_log(scene, 1, CameraPath(scene.motion, scene.duration_s, 1))
-    assert (log is None) == (known == "none")
-    if log is not None:
-        assert (log.heading_deg is None) == (known == "gravity")
-
-
 def test_what_is_stated_of_sites_is_wrong_as_declared() -> None:
     assert survey_sites(SCENE, 5) == sites_of(SCENE)
     one, two, three = SCENE.bars
