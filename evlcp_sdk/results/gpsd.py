@@ -85,8 +85,7 @@ def answer_request(
     if text:
         watch["enable"] = bool(options.get("enable", True))
         watch |= {name: bool(options[name]) for name in ("json", "nmea") if name in options}
-        if options.get("raw"):
-            watch["nmea"] = True
+        watch["nmea"] |= bool(options.get("raw"))
     return [{"class": "DEVICES", "devices": [device]}, {"class": "WATCH", **watch}]
 
 

@@ -86,8 +86,10 @@ def test_clients_are_answered() -> None:
     reported = answer_request('?WATCH={"enable":true,"json":true};', watch, {})
     assert [one["class"] for one in reported] == ["DEVICES", "WATCH"]
     assert watch == {"enable": True, "json": True, "nmea": False}
-    answer_request('?WATCH={"enable":true,"nmea":true}', watch, {})
-    assert watch["nmea"]
+    for name in ("nmea", "raw"):
+        watch["nmea"] = False
+        answer_request(f'?WATCH={{"enable":true,"{name}":1}}', watch, {})
+        assert watch["nmea"] is True
     assert answer_request("?VERSION;", watch, {})[0]["proto_major"] == 3
     (device,) = answer_request("?DEVICE;", watch, {})
     assert answer_request("?DEVICES;", watch, {}) == [{"class": "DEVICES", "devices": [device]}]
