@@ -216,6 +216,11 @@ def test_a_campaign_is_a_table_a_scene(tmp_path: Path) -> None:
     # Twice the error in every frame.
     assert "rmse_m" in whole.tables[2].find_best()[0]
     assert "packets" in whole.tables[0].format_rows()[0]
+    # A link that fails in a scene has an easier rest.
+    *most, last = summary.series
+    part = compare_links(replace(summary, series=(*most, replace(last, recordings=()))))
+    assert [one.name for one in part.tables] == ["distance 30 m", "distance 40 m"]
+    assert "not every link receives every scene" in part.notes[1]
 
 
 PAGE = (ROOT / "docs" / "paper.md").read_text()
