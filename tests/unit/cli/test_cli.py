@@ -158,7 +158,6 @@ SITES = [BarSite(1, 35.1, 137.0, 50.0)]
         ("REC -o OUT --pitch-deg 90 --roll-deg 0", "90.0: expected -89 to 89"),
         ("REC -o OUT --sites S --clock-zero noon", "expected a time such as"),
         ("REC -o OUT --sites S --clock-zero 9999-12-31T23:59:59.9", "expected 1970 to 2199"),
-        ("REC -o OUT --sites none.toml", "none.toml: cannot be read"),
         ("REC -o OUT --gnss none.csv", "needs --sites"),
         ("REC -o REC", "it is read, and would be overwritten"),
     ],

@@ -358,7 +358,6 @@ def positions_beside(strange: list[int], unseen: list[int]) -> dict[str, Any]:
         ("attitude-outside", {"fixes": 1, "attitude_outside": 9}, "none of the attitude's 9 lines is within"),
         ("attitude-missing", {"fixes": 5, "attitude_missing": 2}, "2 of 5 positions have no attitude"),
         ("gnss-outside", {"gnss_outside": 3}, "none of 3 GNSS fixes is within the recording's time"),
-        ("gnss-outside", {"fixes": 1, "gnss_outside": 3, "gnss": 1}, ""),
         ("gnss-without-heading", {"fixes": 1, "gnss_without_heading": 1}, "1 GNSS fix not used, as no"),
     ],
 )

@@ -216,7 +216,6 @@ def test_simulate_writes_a_recording_and_its_truth(tmp_path, evlcp, monkeypatch)
         (("--preset", "night", "-o", "a.raw", "--set", "motion.distance_m=-1"), 2, "motion.distance_m = -1"),
         (("-o", "a.raw"), 2, ""),
         (("--preset", "night"), 2, ""),
-        (("x.toml", "--show"), 2, ""),
         (("nigt", "-o", "a.raw"), 2, "nigt: no such file, and no preset of that name; did you mean 'night'?"),
         (("drive-30kmh", "-o", "a.raw"), 2, "drive-30kmh: no such file; for the preset: --preset drive-30km"),
     ],
