@@ -251,11 +251,7 @@ def _track_poses(
         return poses, list(sites_of.values()), track.summary
     # Until it sent its id, a new bar was taken for a known one: its number belongs to no site.
     numbers = {id: number for number, id in ids.items()}
-    unused = max(ids) + 1
-    sites = tuple(
-        replace(site, transmitter=numbers.get(site.transmitter_id, unused + i))
-        for i, site in enumerate(plan.sites)
-    )
+    sites = tuple(replace(site, transmitter=numbers.get(site.transmitter_id, -1)) for site in plan.sites)
     if sites == plan.sites:
         raise ConfigError(f"{url}: transmitter {wrong[0]} sends one id and then another")
     return _track_poses(url, replace(plan, sites=sites), links, attitude, registry)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,14 +10,19 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place.calibration import CalibrationView, KnownPose
 from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.gnss import GnssLog
+from evlcp_sdk.place.navigator import PositionPlan
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.survey import survey_bars
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
-from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.surveying import survey
+from evlcp_sdk.scene.sites import BarSite, LocalAxes, load_sites
+from evlcp_sdk.sim.truth import read_truth, truth_path
+from evlcp_sdk.simulated import simulate
+from evlcp_sdk.surveying import survey, survey_along_track
 from tests.unit.place.place_scenes import POINTS_ONLY, square
 
 AXES = LocalAxes(35.0, 137.0, 50.0)
@@ -104,3 +110,21 @@ def test_what_cannot_be_surveyed_is_reported() -> None:
     wrong = dataclasses.replace(seen[3], enu_m=seen[3].enu_m + np.array([3.0, 0.0, 0.0]))
     with pytest.raises(ConfigError, match="miss one another"):
         survey_bars([*seen[:3], wrong, *seen[4:]], AXES, 0.96, CAMERA, spec=SPEC)
+
+
+def test_a_bar_alone_in_view_before_its_id_is_surveyed(tmp_path: Path) -> None:
+    """Until its beacon, of two packets, it is the only bar, and is taken for the only known one."""
+    link, recording = load_link(overrides="air.frames_per_packet=6"), tmp_path / "rec.raw"
+    world = {"latitude_deg": 35.0, "longitude_deg": 137.0, "height_m": 50.0}
+    parts = {"link": {"air": link.table["air"]}, "world": world, "motion": {"vib_rate_rad_s": 0.0}}
+    simulate(parts | {"duration_s": 0.07, "bars": [{"payload": "messages"}]}).save(recording)
+    (true,), truth = load_sites(tmp_path / "rec.site.toml"), read_truth(truth_path(recording))
+    place = np.stack([truth.camera_path[name] for name in world], 1)
+    gnss = GnssLog(truth.t_us, place, np.tile(1e-4 * np.eye(3), (len(place), 1, 1)))
+    known = dataclasses.replace(true, transmitter_id=9, latitude_deg=35.001)
+    attitude = Attitude(0.0, 0.0, 0.0, 0.01, 0.01)
+    (found,) = survey_along_track([str(recording)], PositionPlan((known,), gnss), link, attitude=attitude)
+    assert found.site.transmitter_id == true.transmitter_id
+    site = found.site
+    error = LocalAxes.of([true]).to_enu(site.latitude_deg, site.longitude_deg, site.height_m)
+    assert square(error, found.covariance_m2) < 20
