@@ -91,11 +91,14 @@ class PulseClock:
             first_us, *others = self._strays
             self._strays.clear()
             first_s = near_s + first_us * 1e-6
-            if self._near_s is not None and len(self._t_us) > 1:
-                first_s = self.utc_s(first_us) or first_s
             if first_us < self._t_us[-1]:
+                # The clock has restarted: what was known beforehand is of its old 0.
+                first_s = round(first_s) if self._near_s is None else self._s[-1] + 1
+                self._approximate_s = first_s - first_us * 1e-6
                 self._t_us.clear()
                 self._s.clear()
+            elif self._near_s is not None and len(self._t_us) > 1:
+                first_s = self.utc_s(first_us) or first_s
             self.counts["pulses_rejected"] -= _MIN_AGREEING
             self._append_pulse(first_us, round(first_s))
             for other_us in others:

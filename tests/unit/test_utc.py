@@ -72,6 +72,9 @@ def test_strays_are_left_out_and_counted_and_a_leap_is_believed() -> None:
         clock.add(edges([camera_us(second, 0.0) + 300_000]), 0.0, 0.0)
     assert clock.counts == {"pulses": 8, "pulses_rejected": 2}
     assert clock.utc_s(camera_us(7.25, 0.0) + 300_000) == pytest.approx(BEGIN.timestamp() + 7.25, abs=1e-5)
+    # It restarts before second 8, whose pulse is at 0.3 s: UTC goes on.
+    clock.add(edges([300_000, 1_300_000, 2_300_000]), 0.0, 0.0)
+    assert [clock.utc_s(t_us) for t_us in (0, 2_800_000)] == [BEGIN.timestamp() + s for s in (7.7, 10.5)]
 
 
 def test_the_computers_clock_says_which_second_it_is() -> None:
