@@ -231,11 +231,11 @@ def load_link(
     for override in [overrides] if isinstance(overrides, str) else overrides:
         section, key, value = _parse_override(override)
         keys = table.setdefault(section, {})
-        if not isinstance(keys, dict):
-            keys = table[section] = {}
-        keys[key] = value
-        if (section, key) == ("bar", "leds_file"):
-            keys.pop("leds", None)
+        # What the file has instead of a table is refused below.
+        if isinstance(keys, dict):
+            keys[key] = value
+            if (section, key) == ("bar", "leds_file"):
+                keys.pop("leds", None)
         overridden.add((section, key))
     link = resolve(table, registry, source=source, overridden=frozenset(overridden))
     return replace(link, name=Path(source).stem)
