@@ -35,7 +35,8 @@ class InstalledSink:
             PluginError: It cannot be imported.
         """
         record = self.record
-        if missing := [name for name in record.packages if find_spec(name) is None]:
+        # The parent of a dotted name, as that would be imported to find it.
+        if missing := [name for name in record.packages if find_spec(name.partition(".")[0]) is None]:
             how = f"the extra: pip install '{record.extra}'" if record.extra else ", ".join(missing)
             raise ConfigError(f"{self} needs {how}, or leave --sink {record.name} out")
         return import_class(str(self), record.target)
@@ -89,6 +90,9 @@ def _sink_fault(record: SinkRecord, others: Sequence[tuple[SinkRecord, Owner]]) 
         for name in files
     ):
         return f"sink '{record.name}': files = {files!r}, expected names of files in the result's folder"
+    packages: Any = record.packages
+    if not isinstance(packages, tuple | list) or not all(isinstance(name, str) and name for name in packages):
+        return f"sink '{record.name}': packages = {packages!r}, expected names of modules"
     if SUMMARY in record.files:
         return f"sink '{record.name}': {SUMMARY} is the summary's file"
     for other, (owner, _) in others:

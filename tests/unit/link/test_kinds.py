@@ -96,6 +96,15 @@ def bring(number: int, name: str) -> object:
     return SimpleNamespace(evlcp_message_kinds=hookimpl(lambda: iter((kind,))))
 
 
+@pytest.mark.parametrize(
+    ("number", "name", "fault"),
+    [(16, "here", "number = 16, expected 7 to 15"), (9, "", "name = '', expected"), (9, "packet", "choose")],
+)
+def test_a_kind_without_a_number_or_name_of_its_own_is_left_out(number, name, fault) -> None:
+    with pytest.warns(PluginWarning, match=fault):
+        assert len(find_message_kinds(Registry.load(bring(number, name)))) == 6
+
+
 def test_of_two_kinds_of_one_number_one_stays() -> None:
     registry = Registry.load(bring(9, "here"), bring(9, "there"))
     with pytest.warns(PluginWarning, match="number 9 or its name is that of"):

@@ -1,13 +1,14 @@
 """Sinks: what fails is named, and leaves nothing; `examples/third_party_formats` has one that does not."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from evlcp_sdk.errors import ConfigError, PluginError
+from evlcp_sdk.errors import ConfigError, PluginError, PluginWarning
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
 from evlcp_sdk.plugin.records import find_sinks
@@ -81,6 +82,21 @@ def test_what_fails_is_named_and_leaves_nothing(name: str, message: str, tmp_pat
         result(tmp_path / "out", *packets(1), link=load_link(), registry=registry, sinks=["it"])
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "fault"),
+    [
+        ({"name": 5}, "name = 5, expected text"),
+        ({"files": ("a/b",)}, r"files = \('a/b',\), expected names of files"),
+        ({"files": ("summary.json",)}, "summary.json is the summary's file"),
+        ({"packages": "pandas"}, "packages = 'pandas', expected names of modules"),
+    ],
+)
+def test_a_record_that_is_no_sink_s_is_left_out(wrong, fault):
+    record = replace(SinkRecord("it", "it:It", ("it.txt",), "a test"), **wrong)
+    with pytest.warns(PluginWarning, match=fault):
+        assert not find_sinks(Registry(SimpleNamespace(evlcp_sinks=hookimpl(lambda: [record]))))
 
 
 def test_a_sink_that_fails_at_a_stage_is_named(demo_raw: Path, tmp_path: Path) -> None:
