@@ -312,6 +312,24 @@ def test_an_attitude_file(tmp_path: Path) -> None:
         AttitudeLog.read(path)
 
 
+def test_a_bar_off_its_site_is_off_in_the_track_s_axes() -> None:
+    """Left out by the two others, far from the track's origin."""
+    third = site(11, (0.5, 3.0, 1.5), 2)
+    p = positioner([LEFT, RIGHT, site(11, (1.5, 3.0, 1.9), 2)], Attitude(4.0, 1.0, 0.0, 0.1, 0.2))
+    p.axes = LocalAxes(10.0, 60.0, 40.0)
+    fix = fixes_of(p, merge(*(packets_of(bar, n, 3) for n, bar in enumerate((LEFT, RIGHT, third)))))[1]
+    assert fix.failed is not None
+    assert fix.failed.off_m @ p.axes.rotation_from(ORIGIN) == pytest.approx([-1.0, 0.0, -0.4], abs=1e-3)
+
+
+def test_the_focal_length_that_would_fit_is_found() -> None:
+    p = Positioner({"": resolve({"camera": {"focal_mm": 50.0}})}, [LEFT, RIGHT], lambda _t: EXACT)
+    assert math.isnan(p.search_focal_mm())
+    fixes = fixes_of(p, merge(packets_of(LEFT, 0, 3), packets_of(RIGHT, 1, 3)))
+    assert {fix.refusal for fix in fixes} == {"misfit"}
+    assert p.search_focal_mm() == pytest.approx(CAMERA.focal_mm, rel=0.01)
+
+
 def test_poses_that_are_left_open_are_reported_on_earth() -> None:
     here, axes = LocalAxes(35.2, 137.1, 60.0), LocalAxes(35.0, 137.0, 50.0)
     spread = np.diag([1.0, 4.0, 9.0])

@@ -39,8 +39,8 @@ def events_of(rng, rate_hz, seconds, burst, noise_hz):
     return merge_events(Events.of(np.floor(t), np.rint(x), np.rint(y), p))
 
 
-def regions_of(link, events, seconds):
-    detector = Spots().compile(link.camera, link.codebook, link.packet)
+def regions_of(link, events, seconds, **given):
+    detector = Spots(**given).compile(link.camera, link.codebook, link.packet)
     state, found = detector.init(), []
     for start_us in range(0, int(seconds * 1e6), STEP_US):
         a, b = np.searchsorted(events.t_us, (start_us, start_us + STEP_US))
@@ -70,6 +70,18 @@ def test_a_light_is_followed_though_it_shakes_and_is_dark_for_long(rate_hz, burs
         total += int(of_light.sum())
         inside += int((of_light & across & down).sum())
     assert inside >= 0.985 * total
+
+
+@pytest.mark.parametrize(("burst", "opened"), [(100, 2), (20, 1)])
+def test_the_brightest_lights_are_followed(burst, opened):
+    """Of two lights where one may be: the later one takes its place if it is brighter."""
+    link = link_of(500.0)
+    first, late = (events_of(np.random.default_rng(1), 500.0, 0.4, n, 0.0) for n in (50, burst))
+    late = late[late.t_us >= 200_000]
+    events = merge_events(first, Events(late.t_us, late.x + np.uint16(300), late.y, late.p))
+    found = regions_of(link, events, 0.4, most=1)
+    assert len({region.id for _, regions in found for region in regions}) == opened
+    assert all(len(regions) < 2 for _, regions in found)
 
 
 def test_there_is_no_light_in_noise_or_in_what_moves():
