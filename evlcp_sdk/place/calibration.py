@@ -137,9 +137,6 @@ _CAMERA_SIZE, _BAR_SIZE = len(CAMERA_PARAMETERS), 8
 """Unknowns of the camera, and of a bar: of its site three of place, three of rotation, its length; its
 apparent curvature."""
 
-_LINE_SHARE = 1e-6
-"""Share of the squares of a line's points about their middle that may lie across it."""
-
 
 @dataclass(frozen=True, eq=False)
 class CalibrationView:
@@ -320,12 +317,10 @@ def _curvature_slopes(enu_m: Floats, seen: NDArray[np.bool_], points_px: Floats)
     """Shifts of the seen points of a line by its curvature along itself, in the image, float64 (n, 2).
 
     The mode is quadratic in a point's place, without constant and linear part; the sum of squares over the
-    whole bar is 1. 0 for clusters that are not in line.
+    whole bar is 1.
     """
     arm = enu_m - enu_m.mean(0)
     along = arm @ np.linalg.svd(arm)[2][0]
-    if (arm**2).sum() - along @ along > _LINE_SHARE * (arm**2).sum():
-        return np.zeros((int(seen.sum()), 2))
     modes, _ = np.linalg.qr(np.stack([np.ones_like(along), along, along**2], 1))
     axis = points_px[seen][-1] - points_px[seen][0]
     return np.asarray(modes[seen, 2][:, None] * (axis / max(float(np.linalg.norm(axis)), 1e-9)))
