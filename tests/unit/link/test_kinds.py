@@ -97,17 +97,15 @@ def bring(number: int, name: str) -> object:
 
 
 @pytest.mark.parametrize(
-    ("number", "name", "fault"),
-    [(16, "here", "number = 16, expected 7 to 15"), (9, "", "name = '', expected"), (9, "packet", "choose")],
+    ("numbers", "name", "fault"),
+    [
+        ((9, 9), "here", "number 9 or its name is that of"),
+        ((16,), "here", "number = 16, expected 7 to 15"),
+        ((9,), "packet", "choose another"),
+    ],
 )
-def test_a_kind_without_a_number_or_name_of_its_own_is_left_out(number, name, fault) -> None:
+def test_a_kind_without_a_number_or_name_of_its_own_is_left_out(numbers, name, fault) -> None:
+    registry = Registry.load(*(bring(number, name) for number in numbers))
     with pytest.warns(PluginWarning, match=fault):
-        assert len(find_message_kinds(Registry.load(bring(number, name)))) == 6
-
-
-def test_of_two_kinds_of_one_number_one_stays() -> None:
-    registry = Registry.load(bring(9, "here"), bring(9, "there"))
-    with pytest.warns(PluginWarning, match="number 9 or its name is that of"):
-        kinds = find_message_kinds(registry)
-    assert len(kinds) == 7
+        assert len(find_message_kinds(registry)) == 5 + len(numbers)
     assert len(registry.broken) == 1

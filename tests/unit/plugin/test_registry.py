@@ -93,17 +93,12 @@ BROKEN: dict[str, tuple[Callable[[], object], str]] = {
         lambda: Brings(ranging("mine"), Algorithm("rangin", "x", "a:B", 1, "")),
         "algorithm 'x' has role 'rangin', expected one of detection, framing, pilots, ",
     ),
-    "list": (
-        lambda: Brings(Algorithm(["ranging"], "mine", "a:B", 1, "")),
-        "role = ['ranging'], expected text",
-    ),
     "target": (lambda: Brings(Algorithm("ranging", "mine", 3, 1, "")), "target = 3, expected text"),
     "revision": (
         lambda: Brings(Algorithm("ranging", "mine", "a:B", "1", "")),
         "revision = '1', expected a whole",
     ),
     "record": (lambda: Brings(ranging("mine"), "poc"), "evlcp_algorithms() gave something else than Alg"),
-    "nothing": (lambda: plugin(evlcp_algorithms=lambda: None), "evlcp_algorithms() gave"),
     "fails": (
         lambda: plugin(evlcp_algorithms=failing),
         "evlcp_algorithms() fails: ZeroDivisionError: by design",
@@ -145,11 +140,11 @@ def test_a_broken_plugin_is_left_out_and_reported(fault: str, monkeypatch: pytes
 
 def test_a_plugin_that_fails_when_asked_is_left_out_from_then_on() -> None:
     def fail(url: str) -> None:
-        raise KeyError(url)
+        raise SystemExit(0)
 
     bad = plugin(evlcp_open_events=fail, evlcp_stage_finished=lambda stage: None)
     registry = Registry(bad, plugin(evlcp_open_events=lambda url: f"source of {url}"))
-    with pytest.warns(PluginWarning, match=r"plugin \S+ is .*: evlcp_open_events\(\) fails: KeyError"):
+    with pytest.warns(PluginWarning, match=r"plugin \S+ is .*: evlcp_open_events\(\) fails: SystemExit: 0"):
         answers = registry.call_hook("evlcp_open_events", url="cam:0")
     assert [answer for _, answer in answers] == ["source of cam:0"]
     with pytest.raises(PluginError, match=r"^plugin 'my_cam': expected an object with a method marked"):
@@ -220,30 +215,15 @@ def test_a_strangers_command_that_raises_is_no_fault_of_evlcp(monkeypatch, evlcp
 def test_broken_and_conflicting_plugins_are_listed(monkeypatch: pytest.MonkeyPatch, evlcp: Any) -> None:
     owners = ("evlcp-sdk", "evlcp-fast")
     both = [(owner, owner, lambda: Brings(ranging("poc"))) for owner in owners]
-    lost = ("lost", "evlcp-lost", lambda: Brings(ranging("lost", "nowhere:Nothing")))
+    lost = ("lost", "evlcp-lost", lambda: Brings(ranging("lost", "json:JSONDecoder")))
     install(monkeypatch, *both, ("cam", "evlcp-cam", missing), lost)
     done = evlcp("plugins")
     assert done.code == 0
     assert [line[:6] for line in done.out.splitlines() if line[2:5] == "poc"] == ["! poc "] * 2
     assert "ranging: a decoded frame's image -> distance\n" in done.out
-    assert "\nbroken: ranging algorithm 'lost' of evlcp-lost: cannot import nowhere:Nothing: Mod" in done.out
+    assert "\nbroken: ranging algorithm 'lost' of evlcp-lost: json:JSONDecoder is not a Ranging" in done.out
     assert done.out.endswith("broken: plugin cam of evlcp-cam 1.0: " + BROKEN["import"][1] + "\n")
     table = json.loads(evlcp("plugins", "--json").out)
     assert [a["conflict"] for a in table["algorithms"]] == [False, True, True]
     assert table["broken"][0]["plugin"] == "cam"
     assert {"role": "ranging", "verb": ROLES["ranging"].verb, "default": "joint-scale"} in table["roles"]
-
-
-@pytest.mark.parametrize(
-    ("target", "message"),
-    [
-        ("nowhere:Nothing", "cannot import nowhere:Nothing: ModuleNotFoundError: No module named 'nowhere'"),
-        (":", "cannot import :: "),
-        ("json:JSONDecoder", "json:JSONDecoder is not a Ranging"),
-    ],
-)
-def test_a_target_that_cannot_be_used(target: str, message: str) -> None:
-    registry = Registry(Brings(ranging("x", target)))
-    with pytest.raises(PluginError, match=r"^ranging algorithm 'x' of Brings-\w+: ") as caught:
-        registry.load_class("ranging", "x")
-    assert message in str(caught.value)

@@ -4,13 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from evlcp_sdk.errors import InputError, PluginError, StreamError
-from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.errors import InputError, PluginError
 from evlcp_sdk.plugin.source import EventSource
-from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events, Triggers
 
 
@@ -68,14 +65,3 @@ def test_a_source_that_cannot_be_closed_is_named_unless_something_failed_before(
         pass
     with pytest.raises(InputError, match="lens cap"), Stuck(lambda: None):
         raise InputError("the lens cap is on")
-
-
-def test_a_receiver_is_fed_polarities_only() -> None:
-    receiver = Receiver(load_link())
-    n = 5000
-    rng = np.random.default_rng(0)
-    columns = np.arange(n) * 10, rng.integers(0, 1280, n), rng.integers(0, 720, n)
-    with pytest.raises(StreamError, match="events with polarity 7, expected 0 or 1"):
-        receiver.feed(Events.of(*columns, np.full(n, 7)))
-    receiver.feed(Events.of(*columns, rng.integers(0, 2, n)))
-    receiver.feed(Events.empty())

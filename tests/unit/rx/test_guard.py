@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from rx_streams import lit
 
-from evlcp_sdk.errors import ConfigError, InputError, PluginError, PluginWarning
-from evlcp_sdk.io import open_source
+from evlcp_sdk.errors import ConfigError, InputError, PluginError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
@@ -135,11 +134,6 @@ def but(**changes):
     return lambda found: replace(found, **changes)
 
 
-def curved_range(**changes):
-    """What it says of a lean, of three boundaries, is so."""
-    return but(curvature=replace(Curvature(*np.ones((3, 3))), **changes))
-
-
 def spoilt(name, value, kind=None):
     """One value of an array is another."""
 
@@ -150,6 +144,9 @@ def spoilt(name, value, kind=None):
 
     return change
 
+
+CURVED = replace(Curvature(*np.ones((3, 3))), phase_bias=np.zeros(2))
+"""Of three boundaries."""
 
 ODD = [
     ("synchronization", lambda _: (0.0, 100.0), "tuple, expected SyncLock"),
@@ -176,11 +173,7 @@ ODD = [
     ("ranging", but(distance_m=10**5000), "distance_m = a int that cannot be shown"),
     ("ranging", but(sigma_m=-1.0), r"sigma_m = -1\.0, expected a number from 0, or NaN"),
     ("ranging", but(curvature=3), "int, expected Curvature"),
-    (
-        "ranging",
-        curved_range(phase_bias=np.zeros(2)),
-        r"curvature.phase_bias of shape \(2,\), expected \(3,\)",
-    ),
+    ("ranging", but(curvature=CURVED), r"curvature.phase_bias of shape \(2,\), expected \(3,\)"),
     ("ranging", but(curvature=Curvature(*np.ones((3, 3, 1)))), r"curvature.place of shape \(3, 1\)"),
     ("tracking", lambda found: (found[0] * math.nan, found[1]), r"values \[nan"),
     ("tracking", lambda found: (found[0][:0], found[1]), r"values of shape \(0,\), expected"),
@@ -229,18 +222,11 @@ def test_an_error_correction_that_gives_another_thing_is_named(gives, message):
             receive_stream(link_with("error-correction", compiled))
 
 
-def test_hooks_that_exit_end_nothing(demo_raw):
+def test_a_hook_that_exits_ends_nothing():
     class Exits:
-        @hookimpl
-        def evlcp_open_events(self, url):
-            raise SystemExit(0)
-
         @hookimpl
         def evlcp_stage_finished(self, stage):
             raise SystemExit(0)
 
-    registry = Registry.load(Exits())
     with pytest.raises(PluginError, match=r"^evlcp_stage_finished\(\) of a plugin: SystemExit: 0"):
-        Receiver(LINK, registry.hook).feed(EVENTS)
-    with pytest.warns(PluginWarning, match="evlcp_open_events.* fails: SystemExit: 0"):
-        open_source(demo_raw, registry).close()
+        Receiver(LINK, Registry.load(Exits()).hook).feed(EVENTS)
