@@ -16,7 +16,7 @@ from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.plugin.hooks import Algorithm
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Detection, Modulation, Ranging, Tracking
-from evlcp_sdk.run import receive, receive_to_folder
+from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.values import DecodedFrame, SoftSymbols
 from tests.conftest import Brings, rows_of
@@ -209,9 +209,4 @@ def test_what_was_received_before_it_failed_is_kept(lamp_raw: Path, tmp_path: Pa
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["status"] == "failed"
     assert summary["error"].startswith(message)
-    rows = rows_of(tmp_path / "out" / "frames.csv")
-    assert 5 < len(rows) <= 32
-    reception, packets = receive(lamp_raw, link), []
-    with pytest.raises(PluginError, match=message):
-        packets += reception
-    assert sum(len(packet.frames) for packet in packets) == len(rows)
+    assert 5 < len(rows_of(tmp_path / "out" / "frames.csv")) <= 32

@@ -53,7 +53,8 @@ LINKS: dict[str, Settings] = {
     "a panel": {f"bar.{key}": value for key, value in PANEL.items()},
     "few pilots of barker13": {"pilots.id": "barker13", "air.pilot_every": 4, "air.frames_per_packet": 20},
     "a stranger's modulation of 4 clusters": {**column(4, 6), "modulation.id": "four"},
-    "no pair code": {"modulation.id": "nrz"},
+    "no pair code": {"modulation.id": "nrz", "modulation.bits": 6, "air.pilot_every": 4},
+    "pulses": {"modulation.id": "ppm", "modulation.pulses": 2},
     "a quarter of the light": {"modulation.id": "wh4x2-dimmed", "pilots.id": "wh-dimmed"},
     "characters": {**LAMP, "framing.id": "uart", "framing.parity": "even"},
 }
