@@ -59,7 +59,7 @@ class Events:
             if column.dtype != dtype or column.shape != shape or len(shape) != 1:
                 raise StreamError(
                     f"events column {name}: {column.dtype} {column.shape},"
-                    f" expected {dtype} ({len(self.t_us)},)"
+                    f" expected {dtype} ({self.t_us.size},)"
                 )
 
     @classmethod
