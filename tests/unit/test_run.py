@@ -60,14 +60,6 @@ def test_the_last_packet_comes_too_and_the_source_is_closed(demo_raw: Path) -> N
     assert closed
 
 
-def test_leaving_early_closes_the_source(demo_raw: Path) -> None:
-    with receive(RawSource(demo_raw), load_link()) as reception:
-        next(reception)
-    assert list(reception) == []
-    with pytest.raises(InputError, match="closed file"):
-        list(reception.source.chunks())
-
-
 def test_input_that_fails_gives_what_was_decoded_first(demo_raw: Path) -> None:
     class Failing(RawSource):
         def stream(self, max_events: int = DEFAULT_MAX_EVENTS) -> Iterator[tuple[Events, Triggers]]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.air.frames import bits_of_symbols
-from evlcp_sdk.errors import ConfigError, PluginError
+from evlcp_sdk.errors import PluginError
 from evlcp_sdk.link.compose import compose
 from evlcp_sdk.link.resolve import load_link
 
@@ -36,11 +36,6 @@ def test_every_profile_and_length_carries_blocks(overrides: tuple[str, ...]) -> 
         assert symbols.max() < len(link.codebook.codewords)
         air = bits_of_symbols(symbols, link.codebook.bits_per_symbol)
         assert coder.decode_block((4 - 8.0 * air).astype(np.float32)) == block
-
-
-def test_a_text_that_is_not_utf8_is_one_line() -> None:
-    with pytest.raises(ConfigError, match="text: character 2 is not UTF-8"):
-        compose(text="a\udcff")
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,6 @@ def test_what_fails_is_named_and_leaves_nothing(name: str, message: str, tmp_pat
 @pytest.mark.parametrize(
     ("wrong", "fault"),
     [
-        ({"name": 5}, "name = 5, expected text"),
         ({"files": ("a/b",)}, r"files = \('a/b',\), expected names of files"),
         ({"files": ("summary.json",)}, "summary.json is the summary's file"),
         ({"packages": "pandas"}, "packages = 'pandas', expected names of modules"),

@@ -135,6 +135,12 @@ def test_events_that_come_sooner_in_brighter_light(sooner_us):
     assert right_frames(receive_cut(LINK, moved)[1], bar, late_us=(0, 90)) == 30
 
 
+def test_a_bar_in_an_image_that_is_one_region():
+    link = load_link(overrides=["detection.id=whole", "camera.width=100", "camera.height=200"])
+    bar, events = lit(2, link=link, x_px=50.3, y_px=100.7)
+    assert right_frames(receive_cut(link, events)[1], bar, link) == 20
+
+
 def test_a_bar_that_says_nothing_is_no_transmitter():
     """Preambles and pilots show its clusters; the info segments are dark."""
     (bar, events), packet = lit(2), LINK.packet

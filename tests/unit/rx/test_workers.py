@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import pytest
 from rx_streams import LINK, frame_content, frames_of, lit, noise_events, receive_cut
 
-from evlcp_sdk.errors import ConfigError, PluginError, WorkerError
+from evlcp_sdk.errors import ConfigError, InputError, PluginError, WorkerError
 from evlcp_sdk.files import find_shipped_file
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import hookimpl
@@ -78,11 +78,14 @@ def test_what_fails_in_a_worker_is_named():
             receive_cut(broken, EVENTS, workers=many)
 
 
-def test_who_stops_reading_ends_the_workers():
+def test_who_stops_reading_ends_the_workers_and_closes_the_source():
     before = multiprocessing.active_children()
     with receive(find_shipped_file("recordings", "night-50m-30kmh-cut.raw"), workers=2) as packets:
         next(packets)
     assert set(multiprocessing.active_children()) <= set(before)
+    assert list(packets) == []
+    with pytest.raises(InputError, match="closed file"):
+        list(packets.source.chunks())
 
 
 def test_what_cannot_be():
