@@ -148,6 +148,10 @@ def test_stop_ends_in_the_dark_on_a_stream_that_dies_meanwhile(bar):
         bar.chip.run(300)
         assert bar.dark
         assert bar.board.status().state == State.FAULT
+        # a fault within the last chip's interrupt leaves it waiting for what has stopped
+        bar.chip.uc.mem_write(symbol("draining"), bytes([3]))
+        bar.board.test_leds(0, 0, 1)
+        assert bar.chip.resets == [RESET_BY_PIN]
         bar.chip.dma.dead = False
         bar.chip.dma.cr &= ~1
     # what works again plays again

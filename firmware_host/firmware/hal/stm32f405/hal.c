@@ -314,7 +314,6 @@ static void chips_stop(void)
     SCB_ICSR = SYSTICK_FORGET;
     NVIC_ICPR(IRQ_DMA2_STREAM5 / 32u) = 1u << IRQ_DMA2_STREAM5 % 32u;
     __asm volatile("dsb\n isb" ::: "memory");
-    draining = 0u;
 }
 
 static void report_chip_fault(void)
@@ -459,6 +458,7 @@ static void chips_start(uint32_t ticks)
         load(dark);
     gone = 0u;
     served = 0u;
+    draining = 0u; /* a fault may have come just before the core ended */
     overrun = false;
     GPIO_MODER(GPIOA) = (GPIO_MODER(GPIOA) & ~MODE(6, 3)) | MODE(6, MODE_ALTERNATE);
 
