@@ -4,8 +4,8 @@ It knows nothing of the firmware but the wiring of the board (the table in hal.c
 models: what they do between two instructions is worked out from how they were set up. Time is in units of
 1/336 MHz. Timers, DMA, SPI and the latch are exact to the clock against each other; an instruction counts as
 one clock of the core, so its speed is an estimate. The timers, the stream, SPI, USART and SysTick raise at a
-setting that they do not know; ports, PWR, DAC and EXTI keep what is written. A peripheral's `read`
-and `write` are what the core does to a register.
+setting that they do not know, PWR and the flash at one that the clock does not allow; ports, DAC and EXTI
+keep what is written. A peripheral's `read` and `write` are what the core does to a register.
 """
 
 import heapq
@@ -38,6 +38,9 @@ RETURN = 0x1FFE0000
 RESET_BY_PIN, RESET_BY_SOFTWARE, RESET_BY_IWDG = 1 << 26, 1 << 28, 1 << 29
 TO_ITSELF = b"\xfe\xe7"
 """An instruction that jumps to itself: nothing but an event ends it."""
+
+PWR_CR = 0x40007000
+SCALE = "168 MHz need scale 1 of the regulator, which reset sets (RM0090 5.4.1)"
 
 SLICE = 240
 """Instructions from one look at the events to the next, at most: 1.4 us at 168 MHz."""
@@ -478,6 +481,7 @@ class Flash(Peripheral):
         if offset == 0x00:
             # a cache is reset only while it is off
             assert not (value & 0x1800 and value & 0x600), hex(value)
+            assert self.chip.cycle != 2 or value & 7 == 5, "168 MHz need 5 wait states (RM0090 3.5.1)"
             if value & 0x1800 == 0x1800:
                 self.stale = False
             self.acr = value
@@ -528,6 +532,7 @@ class Stm32:
         whole = FlashImage.read(image) if isinstance(image, Path) else image
         uc.mem_write(whole.address, whole.data)
         uc.hook_add(unicorn.UC_HOOK_MEM_READ, self._slot_read, begin=0x080C0000, end=0x080FFFFF)
+        uc.hook_add(unicorn.UC_HOOK_MEM_WRITE, self._flash_write, begin=0x08000000, end=0x080FFFFF)
         self.now = 0
         self.events = []
         self.order = count()
@@ -543,7 +548,7 @@ class Stm32:
         self.resets.append(cause)
         self.events.clear()
         self.plain = {0x40023800: 0x83, 0x40023874: cause, 0x40023804: 0x24003010}
-        self.plain[0x40020000] = 0xA8000000
+        self.plain |= {0x40020000: 0xA8000000, PWR_CR: 1 << 14}
         self.cycle = UNIT_HZ // HSI_HZ
         self.enabled = set()
         self.pending = set()
@@ -595,6 +600,7 @@ class Stm32:
                 pll = 7 << 24 | 1 << 22 | 336 << 6 | m
                 assert self.plain[0x40023804] == pll, "not 168 MHz by this crystal"
                 assert self.flash.acr & 7 == 5
+                assert self.plain[PWR_CR] & 1 << 14, SCALE
             self._core_cycle(2 if fast else UNIT_HZ // HSI_HZ)
             value |= (value & 3) << 2
         self.plain[at] = value
@@ -658,6 +664,10 @@ class Stm32:
     def _slot_read(self, uc, access, at, size, value, data):
         assert not self.flash.stale, f"{at:#x} is read through caches that were not flushed"
 
+    def _flash_write(self, uc, access, at, size, value, data):
+        assert (size, self.flash.cr & 0x80000303) == (4, 0x201), "words, by an unlocked PG (RM0090 3.6.4)"
+        assert not value & ~int.from_bytes(uc.mem_read(at, 4), "little"), f"{at:#x} is not erased"
+
     def _read(self, uc, offset, size, base):
         at = base + offset
         if at == 0x40000024:  # by far the most frequent one
@@ -698,6 +708,10 @@ class Stm32:
             self.pending -= numbers(at - 0xE000E280, value) - self.lines
         elif 0xE000E400 <= at < 0xE000E500:
             self.priorities[16 + at - 0xE000E400] = value & 0xF0
+        elif at == PWR_CR:
+            assert self.plain.get(0x40023840, 0) & 1 << 28, "PWR without its clock"
+            assert self.cycle != 2 or value & 1 << 14, SCALE
+            self.plain[at] = value
         elif at == 0xE000ED0C:
             assert value == 0x05FA0004
             self.restarts = True
