@@ -195,7 +195,9 @@ def _restart_board(board: Board, wait_s: float) -> None:
             board.info = session.hello()
             if board.status().requests < requests:
                 return
-            raise VerifyError(f"{session.name}: has not been reset; run the command again")
         except BoardError:
             if line.time_s() > end:
                 raise
+        else:
+            if line.time_s() > end:
+                raise VerifyError(f"{session.name}: has not been reset; run the command again")
