@@ -12,6 +12,7 @@ from pydantic import Field
 from evlcp_sdk.air.codebook import word_of_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.signals import Stopped, never_stop
 from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, make_queue
 from firmware_host.board.session import Session
 from firmware_host.board.stream import DEFAULT_AHEAD, Stream
@@ -40,6 +41,9 @@ _MAX_HOLD = 255
 
 _SMALLEST_PIECE_BYTES = 32
 """Smallest piece that is tried on a noisy line."""
+
+_LOOK_S = 1.0
+"""Longest time without a look at whether to end."""
 
 Progress = Callable[[float, float], None]
 """Called with the amount done and that in all, bytes or seconds."""
@@ -547,13 +551,15 @@ class Board:
             )
         return status
 
-    def wait_with_keep_alive(self, seconds: float, status: protocol.StatusReply) -> None:
+    def wait_with_keep_alive(
+        self, seconds: float, status: protocol.StatusReply, stopped: Stopped = never_stop
+    ) -> None:
         """Wait, with requests often enough for the watchdog in the board's last status not to act."""
         line = self.session.transport
         end = line.time_s() + seconds
         acts = status.watchdog != Watchdog.KEEP
-        pulse = status.watchdog_ms / 3e3 if acts else seconds
-        while (left := end - line.time_s()) > 0.0:
+        pulse = min(_LOOK_S, status.watchdog_ms / 3e3) if acts else _LOOK_S
+        while (left := end - line.time_s()) > 0.0 and not stopped():
             line.read(min(left, pulse))
             if acts and line.time_s() < end:
                 self.status()

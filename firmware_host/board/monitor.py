@@ -77,7 +77,7 @@ def watch_board(
                 yielded += 1
                 if yielded == count:
                     return
-                board.wait_with_keep_alive(interval_s, status)
+                board.wait_with_keep_alive(interval_s, status, ended.is_set)
             except (LineError, NoBoardError) as fault:
                 board = None
                 with contextlib.suppress(BoardError):

@@ -4,14 +4,18 @@ import json
 import re
 import signal
 import socket
+import threading
+import time
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
+from unittest.mock import Mock
 
 import pytest
 from board_lines import FatalLine, board_on, check_fault, some_bank, well
 
 from firmware_host.board.board import Board, Settings, provision
-from firmware_host.board.monitor import BoardReturned, watch_board
+from firmware_host.board.monitor import BoardReturned, KeyMissing, watch_board
 from firmware_host.board.session import Session
 from firmware_host.board.stream import Stream
 from firmware_host.board.update import UpdatePackage, update_firmware
@@ -59,6 +63,30 @@ def test_program_keeps_alive_until_it_is_ended(evlcp, monkeypatch):
     monkeypatch.setattr(Board, "wait_with_keep_alive", wait_with_keep_alive)
     done = well(evlcp("board", "program", "--random", 1, "--port", "native:", "--keep-alive"))
     assert done.err == "evlcp: native:: state dark, faults none\n"
+
+
+ONE = '[[board]]\nid = "a"\nport = "{}"\nposition_m = [0, 0, 0]\nrandom = 1\n'
+
+
+def test_what_happens_to_a_fleet_is_reported_without_its_statuses(evlcp, tmp_path, monkeypatch):
+    (tmp_path / "one.toml").write_text(ONE.format("native:"))
+    events = [Mock(spec=StatusReply), LineError("x: the line broke"), BoardReturned(1.25), KeyMissing()]
+    monkeypatch.setattr("firmware_host.board.monitor.watch_board", lambda *_: iter(events))
+    done = well(evlcp("board", "program", "--inventory", tmp_path / "one.toml", "--keep-alive", "--json"))
+    _, lost, back = map(json.loads, done.out.splitlines())
+    assert (lost["id"], lost["error"]["kind"], back["back_after_s"]) == ("a", "LineError", 1.25)
+    expected = ("x: the line broke; it is looked for", "a: answers again after 1.2 s", "a: has a key")
+    for line, words in zip(done.err.splitlines(), expected, strict=True):
+        assert line.startswith(f"evlcp: {words}")
+
+
+def test_ctrl_c_ends_a_watch_of_a_fleet_at_once(evlcp, native, tmp_path, monkeypatch):
+    (tmp_path / "one.toml").write_text(ONE.format(native))
+    interrupt = partial(signal.pthread_kill, threading.main_thread().ident, signal.SIGINT)
+    monkeypatch.setattr("firmware_host.commands.board._print_event", lambda *_: interrupt())
+    begin = time.monotonic()
+    well(evlcp("board", "monitor", "--inventory", tmp_path / "one.toml", "--interval", 60))
+    assert time.monotonic() - begin < 20
 
 
 def test_ctrl_c_ends_the_stream_of_a_message(evlcp, native, monkeypatch):
