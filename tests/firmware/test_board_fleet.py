@@ -109,6 +109,19 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards, tmp_path):
     check_fault(evlcp("board", "verify", "--inventory", file), 7, "T0")
 
 
+def test_a_fleet_at_one_pulse(evlcp, boards, tmp_path):
+    places = [board.line.place for board in boards[:2]]
+    file = inventory(tmp_path / "tunnel.toml", places, {})
+    together = ("board", "start", "--inventory", file, "--pulse-hz", 2, "--timeout", 10, "--json")
+    check_fault(evlcp(*together), 5, "NOTHING_COMMITTED")
+    well(evlcp("board", "program", "--inventory", file))
+    well(evlcp("board", "stop", "--inventory", file))
+    for board in boards[:2]:
+        board.board._device.bench.pulse_period = 5e6
+    done = json.loads(well(evlcp(*together)).out)
+    assert (done["state"], list(done["at_pulse"])) == ("playing", places)
+
+
 @pytest.mark.parametrize(
     ("text", "code", "expected"),
     [
