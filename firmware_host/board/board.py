@@ -42,9 +42,6 @@ _MAX_HOLD = 255
 _SMALLEST_PIECE_BYTES = 32
 """Smallest piece that is tried on a noisy line."""
 
-_LOOK_S = 1.0
-"""Longest time without a look at whether to end."""
-
 Progress = Callable[[float, float], None]
 """Called with the amount done and that in all, bytes or seconds."""
 
@@ -558,9 +555,9 @@ class Board:
         line = self.session.transport
         end = line.time_s() + seconds
         acts = status.watchdog != Watchdog.KEEP
-        pulse = min(_LOOK_S, status.watchdog_ms / 3e3) if acts else _LOOK_S
+        pulse = status.watchdog_ms / 3e3 if acts else seconds
         while (left := end - line.time_s()) > 0.0 and not stopped():
-            line.read(min(left, pulse))
+            line.read(min(left, pulse, 1.0))  # not long, as it may be stopped
             if acts and line.time_s() < end:
                 self.status()
 

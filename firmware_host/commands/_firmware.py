@@ -126,10 +126,8 @@ def update(
     """
     if (file is not None) + (target is not None) + confirm != 1:
         raise ConfigError("give an update, --target to build one, or --confirm, one of the three")
-    package = None
-    if file is not None:
-        package = host.update.UpdatePackage.read(file)
-    elif target is not None:
+    package = None if file is None else host.update.UpdatePackage.read(file)
+    if target is not None:
         package = host.update.UpdatePackage.build(target)
     with open_board(context) as board:
         if package is None:

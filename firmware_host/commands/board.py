@@ -443,9 +443,8 @@ def _watch_fleet(
                 print_stderr(f"{entry.id}: {fault}")
 
     with ThreadPoolExecutor(len(entries)) as pool:
-        watches = [pool.submit(watch_entry, entry) for entry in entries]
         try:
-            for watch in watches:
+            for watch in [pool.submit(watch_entry, entry) for entry in entries]:
                 watch.result()
         except KeyboardInterrupt:
             return

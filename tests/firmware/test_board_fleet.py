@@ -1,6 +1,9 @@
 """Fleets: one inventory, many boards, some of which fail."""
 
 import json
+import signal
+import threading
+import time
 from contextlib import ExitStack
 
 import pytest
@@ -92,6 +95,12 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards, tmp_path):
     assert [row["state"] for row in rows("blank")] == ["dark"] * 3
     assert [(row["slot"], row["save_sequence"]) for row in rows("save", "--autostart")] == [(0, 1)] * 3
     assert [row["state"] for row in rows("start")] == ["playing"] * 3
+    rows("blank")
+    together = ("board", "start", "--inventory", file, "--pulse-hz", 2, "--timeout", 20, "--json")
+    for one in boards[:3]:
+        one.board._device.bench.pulse_period = 5e6
+    started = json.loads(well(evlcp(*together)).out)
+    assert (started["state"], list(started["at_pulse"])) == ("playing", [b.line.place for b in boards[:3]])
     seen = rows("monitor", "--count", 2, "--interval", 0.01)
     assert [row["id"] for row in seen] == ["T0", "T0", "T1", "T1", "T2", "T2"]
     assert {row["state"] for row in seen} == {"playing"}
@@ -107,19 +116,6 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards, tmp_path):
     assert error["error"]["kind"] == "FleetError"
     file.write_text(file.read_text().replace("Tempo 30", "Tempo 50"))
     check_fault(evlcp("board", "verify", "--inventory", file), 7, "T0")
-
-
-def test_a_fleet_at_one_pulse(evlcp, boards, tmp_path):
-    places = [board.line.place for board in boards[:2]]
-    file = inventory(tmp_path / "tunnel.toml", places, {})
-    together = ("board", "start", "--inventory", file, "--pulse-hz", 2, "--timeout", 10, "--json")
-    check_fault(evlcp(*together), 5, "NOTHING_COMMITTED")
-    well(evlcp("board", "program", "--inventory", file))
-    well(evlcp("board", "stop", "--inventory", file))
-    for board in boards[:2]:
-        board.board._device.bench.pulse_period = 5e6
-    done = json.loads(well(evlcp(*together)).out)
-    assert (done["state"], list(done["at_pulse"])) == ("playing", places)
 
 
 @pytest.mark.parametrize(
@@ -165,3 +161,12 @@ def test_another_board_on_the_port_is_refused(evlcp, tmp_path):
     assert done.err.startswith("evlcp: a: native:: unique_id")
     file.write_text(ONLY)
     well(evlcp("board", "program", "--inventory", file))
+
+
+def test_ctrl_c_ends_a_watch_at_once(evlcp, tmp_path, monkeypatch):
+    (tmp_path / "one.toml").write_text(GOOD)
+    main, name = threading.main_thread().ident, "firmware_host.commands.board._print_event"
+    monkeypatch.setattr(name, lambda *_: signal.pthread_kill(main, signal.SIGINT))
+    begin = time.monotonic()
+    well(evlcp("board", "monitor", "--inventory", tmp_path / "one.toml", "--interval", 60))
+    assert time.monotonic() - begin < 20

@@ -4,22 +4,18 @@ import json
 import re
 import signal
 import socket
-import threading
-import time
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
-from unittest.mock import Mock
 
 import pytest
 from board_lines import FatalLine, board_on, check_fault, some_bank, well
 
 from firmware_host.board.board import Board, Settings, provision
-from firmware_host.board.monitor import BoardReturned, KeyMissing, watch_board
 from firmware_host.board.session import Session
 from firmware_host.board.stream import Stream
 from firmware_host.board.update import UpdatePackage, update_firmware
-from firmware_host.errors import BoardResetError, IncompatibleError, LineError, NoBoardError, VerifyError
+from firmware_host.commands._line import BoardLine
+from firmware_host.errors import IncompatibleError, LineError, NoBoardError, VerifyError
 from firmware_host.ports.transport import SocketTransport
 from firmware_host.protocol.generated.requests import (
     BoardFault,
@@ -63,30 +59,6 @@ def test_program_keeps_alive_until_it_is_ended(evlcp, monkeypatch):
     monkeypatch.setattr(Board, "wait_with_keep_alive", wait_with_keep_alive)
     done = well(evlcp("board", "program", "--random", 1, "--port", "native:", "--keep-alive"))
     assert done.err == "evlcp: native:: state dark, faults none\n"
-
-
-ONE = '[[board]]\nid = "a"\nport = "{}"\nposition_m = [0, 0, 0]\nrandom = 1\n'
-
-
-def test_what_happens_to_a_fleet_is_reported_without_its_statuses(evlcp, tmp_path, monkeypatch):
-    (tmp_path / "one.toml").write_text(ONE.format("native:"))
-    events = [Mock(spec=StatusReply), LineError("x: the line broke"), BoardReturned(1.25), KeyMissing()]
-    monkeypatch.setattr("firmware_host.board.monitor.watch_board", lambda *_: iter(events))
-    done = well(evlcp("board", "program", "--inventory", tmp_path / "one.toml", "--keep-alive", "--json"))
-    _, lost, back = map(json.loads, done.out.splitlines())
-    assert (lost["id"], lost["error"]["kind"], back["back_after_s"]) == ("a", "LineError", 1.25)
-    expected = ("x: the line broke; it is looked for", "a: answers again after 1.2 s", "a: has a key")
-    for line, words in zip(done.err.splitlines(), expected, strict=True):
-        assert line.startswith(f"evlcp: {words}")
-
-
-def test_ctrl_c_ends_a_watch_of_a_fleet_at_once(evlcp, native, tmp_path, monkeypatch):
-    (tmp_path / "one.toml").write_text(ONE.format(native))
-    interrupt = partial(signal.pthread_kill, threading.main_thread().ident, signal.SIGINT)
-    monkeypatch.setattr("firmware_host.commands.board._print_event", lambda *_: interrupt())
-    begin = time.monotonic()
-    well(evlcp("board", "monitor", "--inventory", tmp_path / "one.toml", "--interval", 60))
-    assert time.monotonic() - begin < 20
 
 
 def test_ctrl_c_ends_the_stream_of_a_message(evlcp, native, monkeypatch):
@@ -168,8 +140,8 @@ def test_a_socket_that_hangs_up_is_reported():
             session.hello()
 
 
-def test_a_monitor_finds_its_board_again(device):
-    """A line that breaks, a board that is off for a while, and one that was reset."""
+def test_a_monitor_finds_its_board_again(evlcp, device, monkeypatch):
+    """A line that breaks, a board that is off for a while, and one that is reset."""
 
     def breaks(_):
         raise LineError("x: the line broke")
@@ -177,22 +149,18 @@ def test_a_monitor_finds_its_board_again(device):
     def off():
         raise NoBoardError("x: it is not there")
 
-    lines = iter([lambda: board_on(FatalLine(device, 50, breaks)), off, *[lambda: board_on(device)] * 2])
+    def fatal(then):
+        return lambda: board_on(FatalLine(device, 50, then))
 
-    def opened():
-        return nullcontext(next(lines)())
-
-    seen = []
-    for what in watch_board(opened, 0.01, count=6):
-        seen.append(what)
-        if len(seen) == 6:
-            device.reset()
-    twice = [StatusReply] * 2
-    lost, reset = [LineError, BoardReturned], [BoardResetError, BoardReturned]
-    assert [type(s) for s in seen] == [*twice, *lost, *twice, *reset, *twice]
-    assert "the line broke" in str(seen[2])
-    assert isinstance(seen[3], BoardReturned)
-    assert seen[3].after_s >= 0.5
-    assert not list(lines)
-    with pytest.raises(NoBoardError):
-        list(watch_board(off, 0.01, count=1))
+    lines = iter([fatal(breaks), off, fatal(lambda line: line.board.reset()), lambda: board_on(device), off])
+    monkeypatch.setattr(BoardLine, "open", lambda _: nullcontext(next(lines)()))
+    monitor = ("board", "monitor", "--port", "x", "--interval", 0.01, "--json")
+    done = well(evlcp(*monitor, "--count", 6))
+    rows = [json.loads(line) for line in done.out.splitlines()]
+    seen = [row["error"]["kind"] if "error" in row else "state" in row for row in rows]
+    assert seen == [True, True, "LineError", False, True, True, "BoardResetError", False, True, True]
+    assert rows[3]["back_after_s"] >= 0.5
+    lost, back, *_ = done.err.splitlines()
+    assert lost == "evlcp: x: the line broke; it is looked for, end with Ctrl-C"
+    assert back.startswith("evlcp: x: answers again after ")
+    check_fault(evlcp(*monitor), 4, "it is not there")
