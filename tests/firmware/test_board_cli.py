@@ -17,6 +17,7 @@ from board_lines import Native, check_fault, well
 
 from evlcp_sdk.errors import OutputError
 from firmware_host.board.survey import find_board_port, survey_ports
+from firmware_host.board.update import UpdatePackage
 from firmware_host.emulators.led_record import RECORD, LedRecord
 from firmware_host.emulators.native import NativeBoard
 from firmware_host.errors import NoBoardError
@@ -93,6 +94,18 @@ def test_a_users_first_hour(evlcp, native, tmp_path):
     table("start", state="playing")
     table("blank", state="dark")
     assert (tmp_path / "flash.bin").stat().st_size > 80_000
+
+
+def test_the_command_updates_on_trial_and_keeps(evlcp, native, tmp_path):
+    path = tmp_path / "a.update.json"
+    path.write_text(UpdatePackage("native", {1: b"one!", 2: b"two!"}).to_json())
+    update = ("board", "update", "--port", native)
+    assert well(evlcp(*update, path)).out == "image 1 runs, 4 bytes, firmware 1.0.0\n"
+    table = json.loads(well(evlcp(*update, path, "--no-keep", "--json")).out)
+    assert table == {"image": 2, "bytes": 4, "sequence": 2, "firmware": "1.0.0", "kept": False}
+    assert well(evlcp(*update, "--confirm")).out == "image 2 is kept\n"
+    check_fault(evlcp(*update, path, "--confirm"), 2, "one of the three")
+    check_fault(evlcp(*update, "--target", "stm32f405-8mhz"), 8, "is a native")
 
 
 def test_every_command_on_a_board_takes_json_and_a_line():

@@ -2,8 +2,6 @@
 
 import itertools
 import json
-import socket
-import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -192,27 +190,17 @@ def test_the_image_for_another_crystal_boots_by_that_one(stm32):
             stm32(wrong, hse_hz)
 
 
-def test_a_part_without_brown_out_is_reported(evlcp, tmp_path):
+def test_a_part_without_brown_out_is_reported(evlcp, monkeypatch, tmp_path):
     (tmp_path / "image.bin").write_bytes(random_image(1_000).data)
     for warns, options in ((True, ()), (False, ("--brown-out",))):
         rom = RomEmulator()
         before = bytes(rom.options)
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            thread = threading.Thread(target=serve_board, args=(rom, server))
-            thread.start()
-            port = f"tcp:127.0.0.1:{server.getsockname()[1]}"
-            done = evlcp("board", "flash", tmp_path / "image.bin", "--port", port, *options)
-            thread.join(10)
-        assert done.code == 0, done.err
+        monkeypatch.setattr(
+            "firmware_host.ports.transport.open_transport", lambda *_, rom=rom, **__: RomLine(rom)
+        )
+        done = well(evlcp("board", "flash", tmp_path / "image.bin", "--port", "rom:", *options))
         assert ("brown-out reset is off: flash with --brown-out" in done.out) == warns
         assert rom.resets == (not warns)
         # that is set, and nothing else
         assert rom.options[0] == (before[0] if warns else before[0] & 0xF3)
         assert rom.options[1:] == before[1:]
-
-
-def serve_board(rom, server):
-    """A ROM at a port, for one host."""
-    with server.accept()[0] as line:
-        while data := line.recv(4096):
-            line.sendall(rom.receive(data))

@@ -1,7 +1,6 @@
 """The protocol: one definition, golden vectors, datagrams, messages, and the client that speaks it."""
 
 import dataclasses
-import tomllib
 import zlib
 from itertools import pairwise
 from pathlib import Path
@@ -24,10 +23,6 @@ PAYLOADS = [
     for name, value in vars(messages).items()
     if isinstance(value, type) and issubclass(value, WireMessage) and dataclasses.is_dataclass(value)
 ]
-
-
-def definition():
-    return tomllib.loads((generate.HERE / "protocol" / "protocol.toml").read_text())
 
 
 def test_generated_files_are_fresh():

@@ -94,14 +94,10 @@ def test_registers_are_those_of_the_schematic(bar):
     assert (bar.board.info.tick_hz, bar.board.info.hal.rstrip(b"\0")) == (14_000_000, b"stm32f405")
 
 
-def end_stream(chip):
-    chip.dma.cr &= ~1
-
-
 BREAKS = {
     "tim1": (lambda chip: chip.tim1.stop_for_good(), BoardFault.CHIP_LOST, 1.6),
     "stream-stands": (lambda chip: setattr(chip.dma, "dead", True), BoardFault.CHIP_LOST, 1.6),
-    "stream-ends": (end_stream, BoardFault.CHIP_LOST, 1.6),
+    "stream-ends": (lambda chip: setattr(chip.dma, "cr", chip.dma.cr & ~1), BoardFault.CHIP_LOST, 1.6),
     "transfer-error": (lambda chip: chip.dma.error(Dma.TRANSFER_ERROR), BoardFault.CHIP_LOST, 0.1),
     "direct-mode-error": (lambda chip: chip.dma.error(Dma.DIRECT_ERROR), BoardFault.CHIP_LOST, 0.1),
     "fifo-error": (lambda chip: chip.dma.error(Dma.FIFO_ERROR), BoardFault.CHIP_LOST, 0.1),

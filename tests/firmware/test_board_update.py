@@ -6,18 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from board_lines import (
-    FatalLine,
-    NoisyLine,
-    board_link,
-    board_on,
-    check_fault,
-    deafen,
-    some_bank,
-    state_of,
-    symbols_of,
-    well,
-)
+from board_lines import FatalLine, NoisyLine, board_link, board_on, deafen, some_bank, state_of, symbols_of
 
 from evlcp_sdk.errors import InputError
 from firmware_host.board.bank import make_bank, symbol_chips
@@ -207,18 +196,6 @@ def test_a_file_of_an_update(tmp_path):
         assert "codec" not in str(caught.value)
     with pytest.raises(InputError, match="cannot be read: No such file"):
         UpdatePackage.read(tmp_path / "none.json")
-
-
-def test_the_command_updates_on_trial_and_keeps(evlcp, native, tmp_path):
-    path = tmp_path / "a.update.json"
-    path.write_text(package(1).to_json())
-    update = ("board", "update", "--port", native)
-    assert well(evlcp(*update, path)).out == "image 1 runs, 400 bytes, firmware 1.0.0\n"
-    table = json.loads(well(evlcp(*update, path, "--no-keep", "--json")).out)
-    assert table == {"image": 2, "bytes": 400, "sequence": 2, "firmware": "1.0.0", "kept": False}
-    assert well(evlcp(*update, "--confirm")).out == "image 2 is kept\n"
-    check_fault(evlcp(*update, path, "--confirm"), 2, "one of the three")
-    check_fault(evlcp(*update, "--target", "stm32f405-8mhz"), 8, "is a native")
 
 
 # -- the real images, on the model of the part

@@ -84,11 +84,6 @@ def every_request(board, bank, update):
     return answers
 
 
-def read_record(name):
-    lines = (VECTORS / name).read_text().splitlines()[1:]
-    return [(e["dir"], bytes.fromhex(e["hex"])) for e in map(json.loads, lines)]
-
-
 def test_this_host_and_the_firmware_of_2_0(monkeypatch):
     monkeypatch.setattr(session, "MINOR", 1)  # what the host said that was recorded
     line = ReplayTransport(VECTORS / "board-2.0.jsonl")
@@ -108,11 +103,12 @@ def test_the_host_of_2_0_and_this_firmware():
     """It is answered as by its own firmware, as far as an answer does not tell the time."""
     device = SimulatedBoard((7).to_bytes(12, "big"))
     expected, wire, seen = b"", b"", set()
-    for direction, data in read_record("host-2.0.jsonl"):
-        if direction == "rx":
-            expected += data
+    for line in (VECTORS / "host-2.0.jsonl").read_text().splitlines()[1:]:
+        event = json.loads(line)
+        if event["dir"] == "rx":
+            expected += bytes.fromhex(event["hex"])
             continue
-        device.receive(data)
+        device.receive(bytes.fromhex(event["hex"]))
         for _ in range(40):
             device.run(1_000)
             wire += device.take_output()
