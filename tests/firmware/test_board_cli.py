@@ -105,7 +105,6 @@ def test_the_command_updates_on_trial_and_keeps(evlcp, native, tmp_path):
     assert table == {"image": 2, "bytes": 4, "sequence": 2, "firmware": "1.0.0", "kept": False}
     assert well(evlcp(*update, "--confirm")).out == "image 2 is kept\n"
     check_fault(evlcp(*update, path, "--confirm"), 2, "one of the three")
-    check_fault(evlcp(*update, "--target", "stm32f405-8mhz"), 8, "is a native")
 
 
 def test_every_command_on_a_board_takes_json_and_a_line():

@@ -35,6 +35,7 @@ def test_files_hold_one_image(evlcp, tmp_path):
         elf, hexed, binary = (FlashImage.read(path) for path in files)
         assert elf == hexed == binary
         assert (elf.address, len(elf.data)) == (FLASH_START, table["bytes"])
+        check_fault(evlcp("board", "update", "--target", target, "--port", "native:"), 8, "is a native")
 
 
 @pytest.mark.parametrize(

@@ -28,14 +28,10 @@ VECTORS = Path(__file__).parents[1] / "vectors"
 MESSAGES = [json.loads(line) for line in (VECTORS / "protocol-2.jsonl").read_text().splitlines()]
 
 
-def of(table):
-    name = "".join(word.capitalize() for word in f"{table['name']}_{table['kind']}".split("_"))
-    return getattr(requests, name, requests.REPLIES[table["type"]])
-
-
 @pytest.mark.parametrize("table", MESSAGES, ids=lambda t: f"2.{t['minor']}-{t['name']}-{t['kind']}")
 def test_bytes_of_each_message_are_those_of_its_version(table):
-    cls, wire = of(table), bytes.fromhex(table["hex"])
+    name = "".join(word.capitalize() for word in f"{table['name']}_{table['kind']}".split("_"))
+    cls, wire = getattr(requests, name, requests.REPLIES[table["type"]]), bytes.fromhex(table["hex"])
     assert cls is requests.REPLIES[table["type"]] or table["type"] == cls.TYPE
     message = cls.unpack(wire)
     assert message.pack(table["minor"]) == wire
