@@ -19,6 +19,7 @@ from evlcp_sdk.cli import _sdk as sdk
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, print_result
 from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.formatting import format_count
 from evlcp_sdk.signals import stop_on_request
 from firmware_host.commands import _host as host
 from firmware_host.commands._json import AsJson
@@ -81,9 +82,9 @@ def stream(
 def print_stream_result(stream: host.stream.Stream, as_json: bool) -> None:
     """Print the result of a stream."""
     round_trips = round(stream.requests / max(1, stream.sent + stream.pauses), 3)
-    summary = f"{stream.sent} packets, {round_trips:.2f} round trips a packet"
+    summary = f"{format_count(stream.sent, 'packet')}, {round_trips:.2f} round trips a packet"
     if stream.underruns:
-        summary += f"; the board had none to play {stream.underruns} times and showed its idle pattern"
+        summary += f", {format_count(stream.underruns, 'underrun')}: the board showed its idle pattern"
     else:
         summary += ", no underrun"
     table = {"packets": stream.sent, "underruns": stream.underruns, "round_trips": round_trips}
