@@ -158,7 +158,7 @@ def test_a_bag_that_is_written_is_read_back(demo_raw, tmp_path, evlcp):
     from mcap.reader import make_reader
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    store = get_typestore(Stores.ROS2_JAZZY)
+    store = get_typestore(Stores.ROS2_HUMBLE)
     seqs = []
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():

@@ -463,7 +463,7 @@ def test_navsat_is_read_back(tmp_path: Path) -> None:
     reader = pytest.importorskip("mcap.reader", reason="the extra ros is not installed")
     typesys = pytest.importorskip("rosbags.typesys", reason="the extra ros is not installed")
     write(tmp_path, packets(6), PositionPlan((SITE,)), "navsat", clock_zero=ZERO)
-    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     with (tmp_path / "navsat.mcap").open("rb") as file:
         source = reader.make_reader(file)
         assert source.get_header().profile == "ros2"
