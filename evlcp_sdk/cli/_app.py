@@ -89,18 +89,19 @@ def _escape_messages() -> Iterator[None]:
     try:
         yield
     except Exception as fault:
-        format_message = getattr(fault, "format_message", None)
-        if format_message is not None:
-            message = escape_controls(format_message())
-            fault.format_message = lambda: message  # type: ignore[attr-defined]
+        if hasattr(fault, "format_message"):
+            message = escape_controls(fault.format_message())
+            fault.format_message = lambda: message
         raise
 
 
 def _prepare_command(command: Any) -> None:
-    """Let a command, and those of a group, wrap its help to the screen, and refuse repeated options."""
+    """Let a command, and those of a group, wrap its help, give flags no type, and refuse repeated options."""
     for nested in getattr(command, "commands", {}).values():
         _prepare_command(nested)
     command.help = _LINE_BREAK.sub(" ", cleandoc(command.help or ""))
+    for flag in (one for one in command.get_params(typer.Context(command)) if getattr(one, "is_flag", False)):
+        flag.metavar = ""
     command.parse_args = partial(_parse_once, command, command.parse_args)
 
 
@@ -212,8 +213,7 @@ def run() -> None:
         else:
             app, registry = make_app(), sdk.registry.Registry.load()
             strangers = add_plugin_commands(app, registry)
-        group = typer.main.get_group(app)
-        _prepare_command(group)
+        _prepare_command(group := typer.main.get_group(app))
         try:
             group(obj=registry)
         except Exception as fault:

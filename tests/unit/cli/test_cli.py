@@ -81,6 +81,7 @@ def test_every_help_fits_a_screen_and_names_what_it_leaves_out(evlcp, monkeypatc
         done = evlcp(*names, "--help")
         lines, shown = done.out.splitlines(), set(done.out.split())
         assert "\x1b" not in done.out
+        assert "<bool>" not in done.out, names
         assert len(lines) <= 46, names
         assert max(map(len, lines)) <= 80, names
         hidden = {option for one in command.params if getattr(one, "hidden", False) for option in one.opts}
