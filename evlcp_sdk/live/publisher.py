@@ -54,8 +54,7 @@ class Subscription:
         Waits `timeout_s` for some, 0 not at all, None until something comes or the subscription ends.
         """
         with self._filled:
-            if not self._queue and not self._closed and timeout_s != 0:
-                self._filled.wait_for(lambda: self._queue or self._closed, timeout_s)
+            self._filled.wait_for(lambda: self._queue or self._closed, timeout_s)
             taken, self._queue = list(self._queue), deque()
         return taken
 
@@ -138,12 +137,10 @@ class Publisher:
 
     def publish(self, kind: str, t_us: float, value: Any, late_ms: float | None = None) -> None:
         """Pass a result to all subscriptions to its kind."""
-        listeners = [one for one in self._subscriptions if kind in one.kinds]
-        if not listeners:
-            return
         news = News(kind, t_us, value, late_ms)
-        for one in listeners:
-            one.put(news)
+        for one in self._subscriptions:
+            if kind in one.kinds:
+                one.put(news)
 
     def close(self) -> None:
         """End all subscriptions and pictures; waiting news can still be taken."""
