@@ -306,37 +306,30 @@ class RawSource(EventSource):
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         """As `EventSource.take`; words without any time raise a RawFormatError."""
         out = EventBuffer(max(max_events, self._codec.burst), max(max_events // 16, 1024))
-        if self._decode_into(out) and not out.events and not out.triggers:
-            return None
-        return out.get_filled()
+        self._decode_into(out)
+        return out.get_filled() if out.events or out.triggers else None
 
-    def _decode_into(self, out: EventBuffer) -> bool:
-        """Decode until `out` is full or the file ends; return whether it has ended.
+    def _decode_into(self, out: EventBuffer) -> None:
+        """Decode until `out` is full or the file ends.
 
         Of a pipe it also stops as soon as it has something and would have to wait for more.
         """
         while out.events <= out.room - self._codec.burst and out.triggers < out.trigger_room:
             words = self._get_words()
-            if not len(words):
-                if self._exhausted:
-                    self._finish()
-                    return True
-                if self._is_pipe and (out.events or out.triggers):
-                    return False
-                self._fill()
-                continue
+            if self._exhausted and not len(words):
+                self._finish()
+                return
             used = self._decoder.decode(words, self._position, out, self._exhausted)
             self._start += used
             self._position += used
             if not used:
                 if self._is_pipe and not self._exhausted and (out.events or out.triggers):
-                    return False
+                    return
                 self._fill()
             elif self._start % self._codec.size_bytes:
                 self._fill(0)
             if self._position - self._data_start > TIMELESS_BYTES and not self._decoder.has_time:
                 self._raise_timeless()
-        return False
 
     def _finish(self) -> None:
         if self._position > self._data_start and not self._decoder.has_time:
