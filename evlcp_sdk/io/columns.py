@@ -336,7 +336,7 @@ def _common_step_us(unit: TimeUnit, times: NDArray[Any]) -> int:
         return 1_000_000
     if times.dtype.kind == "f" and times.dtype.itemsize == 8:
         digits = np.spacing(np.abs(finite).max()) * unit.length_us
-        steps = steps[steps > 4 * digits] if digits > 0.01 else steps
+        steps = steps[steps > 4 * digits]
     steps_us = np.rint(steps[(steps >= 0.5) & (steps < LAST_TIME_US)]).astype(np.int64)
     return math.gcd(*steps_us.tolist())
 

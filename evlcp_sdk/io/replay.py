@@ -73,8 +73,6 @@ class LoopSource(WrappingSource):
         elif is_first:
             self._shift_us = self._last_us + LOOP_GAP_US - first_us
         self._last_us = last_us + self._shift_us
-        if not self._shift_us:
-            return piece
         return (
             Events(events.t_us + self._shift_us, events.x, events.y, events.p),
             Triggers(triggers.t_us + self._shift_us, triggers.channel, triggers.value),
