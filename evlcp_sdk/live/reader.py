@@ -91,8 +91,7 @@ class Reader:
                 return None
             piece = self._waiting.popleft()
             self._events -= len(piece.events)
-            if not self._source.live:
-                self._changed.notify_all()
+            self._changed.notify_all()
             return piece
 
     def stop(self) -> None:
