@@ -75,7 +75,7 @@ class TcpOutput(Server):
         if not self._is_given and news.t_us < self._last_us - _RESTART_US:
             self._zero = datetime.now(UTC) - timedelta(microseconds=news.t_us)
         self._last_us = news.t_us
-        if news.kind != "fix" or not (self._clients or self._gpsd):
+        if news.kind != "fix":
             return
         fix, place = news.value.fix, news.value.filtered
         zero = clock_zero_at(self._zero, fix.t_us)

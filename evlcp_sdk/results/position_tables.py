@@ -124,10 +124,8 @@ class PointsCsv(_Table):
         """Write a row per frame that has a distance and is no reflection."""
         link = self.run.link_of(packet.link)
         errors = ErrorModel.of(link.position)
-        for frame in packet.frames:
-            point = None
-            if frame.echo_of is None:
-                point = locate_bar(frame, link.bar.length_m, link.camera, link.camera_sigma, errors)
+        for frame in (frame for frame in packet.frames if frame.echo_of is None):
+            point = locate_bar(frame, link.bar.length_m, link.camera, link.camera_sigma, errors)
             if point is not None:
                 self._rows.writerow(
                     [
