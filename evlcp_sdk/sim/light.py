@@ -382,8 +382,8 @@ def background_switches(background: BackgroundSpec, begin_us: float, end_us: flo
     for (from_s, first), (to_s, last) in pairwise(background.change_s):
         steps = math.ceil(abs(math.log(last / first)) / _BACKGROUND_STEP_LN)
         at = np.arange(steps)
-        when.append((from_s + (at + 0.5) / max(steps, 1) * (to_s - from_s)) * 1e6)
-        held.append(first * (last / first) ** ((at + 1) / max(steps, 1)))
+        when.append((from_s + (at + 0.5) / steps * (to_s - from_s)) * 1e6)
+        held.append(first * (last / first) ** ((at + 1) / steps))
     return cut_changes(np.concatenate(when), np.concatenate(held), begin_us, end_us)
 
 

@@ -95,8 +95,7 @@ class CameraPath:
         vibration_rad = self._vibration.angle_rad(t_us)
         attitude[:, 0] += m.vib_yaw_share * vibration_rad[0]
         attitude[:, 1] += vibration_rad[1]
-        if m.pothole_s:
-            attitude[:, 1] += pothole_angle_rad(m, t_us)
+        attitude[:, 1] += pothole_angle_rad(m, t_us)
         return position, attitude
 
 

@@ -643,10 +643,8 @@ class _Readout:
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
         sensor, camera = simulation.scene.sensor, simulation.scene.camera
-        early_us = min(sensor.dly_on_us, sensor.dly_off_us)
-        if sensor.jitter_us > 0:
-            early_us = max(0.0, early_us - _kernels.NOISE_LIMIT * sensor.jitter_us)
-        self._early_us = early_us
+        early_us = min(sensor.dly_on_us, sensor.dly_off_us) - _kernels.NOISE_LIMIT * sensor.jitter_us
+        self._early_us = max(0.0, early_us)
         self._begin_us = 0.0
         # Requests too late for the last block, and those waiting at its end, since its start.
         self._later, self._queue = np.empty(0, np.int64), np.empty(0, np.int64)
@@ -694,6 +692,5 @@ class _Readout:
         simulation.counts["dropped_blind"] += cut - kept + held
         simulation.counts["events"] += written
         simulation.counts["dropped_by_rate_cap"] += dropped
-        if simulation.scene.t0_us:
-            columns[0][:written] += simulation.scene.t0_us
+        columns[0][:written] += simulation.scene.t0_us
         return Events(columns[0][:written], columns[1][:written], columns[2][:written], columns[3][:written])
