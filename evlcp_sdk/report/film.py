@@ -290,7 +290,7 @@ def _clamp_range(middle: float, size: float, most: int) -> tuple[int, int]:
 
 
 def _box_of_frame(frame: Frame) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    known = frame.points_px[np.isfinite(frame.points_px).all(1)] if len(frame.points_px) else frame.points_px
+    known = frame.points_px[np.isfinite(frame.points_px).all(1)]
     points = np.concatenate([known, [[frame.x_px, frame.y_px]]])
     # Half a cluster beyond the middles of the clusters.
     margin = np.ptp(points, axis=0).max() / 2 / max(len(known) - 1, 1)

@@ -187,7 +187,7 @@ class Report(ChartSink):
             places = np.array([(frame.x_px, frame.y_px) for frame in frames])
             labels = label_frames(name, frames, axis)
             image.add_dots(places[:, 0], places[:, 1], transmitter_colour(number), name, labels)
-            if len(frames) and np.isfinite(places[-1]).all():
+            if np.isfinite(places[-1]).all():
                 image.add_name(float(places[-1, 0]), float(places[-1, 1]), str(number))
         return image
 

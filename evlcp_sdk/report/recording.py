@@ -230,7 +230,7 @@ def _plot_maps(
     if points:
         fixes = [point.fix for point in points]
         fixed = np.array([fix.enu_m for fix in fixes])
-        selected = fixes[:: max(1, -(-len(fixes) // _MAX_ELLIPSES))]
+        selected = fixes[:: -(-len(fixes) // _MAX_ELLIPSES)]
         scale = choose_ellipse_scale([fix.covariance_m2 for fix in selected], fixed)
         name = "95 % ellipse" + (f", {scale} times as large" if scale > 1 else "")
         for fix in selected:

@@ -112,9 +112,8 @@ def tally_messages(packets: Iterable[Packet], truth: Truth, coder: BlockCoder) -
         if packet.block is None or not packet.frames or packet.echo_of is not None:
             continue
         t_us, first = packet.t_us - truth.t0_us, packet.frames[0]
-        nearest = find_nearest_bar(bars, truth, t_us, first.x_px, first.y_px)
-        bar = 0 if nearest is None else nearest[0]
-        number = None if nearest is None else find_start(sent[bar][0], t_us, bars[bar].link.packet)
+        bar, _ = find_nearest_bar(bars, truth, t_us, first.x_px, first.y_px) or (0, math.inf)
+        number = find_start(sent[bar][0], t_us, bars[bar].link.packet) if bars else None
         if number is None:
             tallies.append((0, Tally(messages_wrong=1)))
             continue

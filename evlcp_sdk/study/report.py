@@ -70,7 +70,7 @@ def draw_charts(summary: Summary) -> list[Plot]:
         # Colour shows the scene, dash the link; neighbours are shifted a little.
         colour = scene if len(set(scenes)) > 1 else link
         style = TRANSMITTER_COLOURS[colour % len(TRANSMITTER_COLOURS)], DASHES[link % len(DASHES)]
-        shift = (number - (len(series) - 1) / 2) * min(0.7, 5 / max(len(series), 1))
+        shift = (number - (len(series) - 1) / 2) * min(0.7, 5 / len(series))
         for kind, chart in by_kind.items():
             _draw_segments(chart, one, kind, shift, *style)
         _draw_bins(histogram, one, *style)
