@@ -107,7 +107,7 @@ class SentFrames:
         chips = np.where(lengths > packet.info_chips, packet.pilot_chips, packet.info_chips)
         middle = chips / 2 * packet.chip_us
         distance_m: Floats = np.interp(start_us[sent] + middle[sent], truth.t_us, bar.distance_m)
-        symbols = np.asarray(bar.symbols, np.int64).reshape(-1, clusters)[: len(chip_numbers)]
+        symbols = bar.symbols.reshape(-1, clusters)[: len(chip_numbers)]
         return cls(bar, start_us[sent], start_us[~sent], symbols[sent], distance_m, hidden[sent], cut[sent])
 
 
@@ -116,11 +116,10 @@ def _mark_hidden(
 ) -> None:
     """Mark clusters that are hidden during the whole of each time, or during part of it, (n, clusters)."""
     clusters = whole.shape[1]
-    covered = list(bar.covered)
-    whole[:, covered] = part[:, covered] = True
+    whole[:, bar.covered] = part[:, bar.covered] = True
     recovery_us = RECOVERY_CHIPS * bar.link.packet.chip_us
     for from_s, to_s, first, last in (*bar.cover_s, *((a, b, 0, clusters - 1) for a, b in bar.pole_s)):
-        clusters_hidden = slice(int(first), int(last) + 1)
+        clusters_hidden = slice(first, last + 1)
         part[(start_us < to_s * 1e6 + recovery_us) & (end_us > from_s * 1e6), clusters_hidden] = True
         whole[(start_us >= from_s * 1e6) & (end_us <= to_s * 1e6), clusters_hidden] = True
 

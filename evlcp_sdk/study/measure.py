@@ -60,7 +60,7 @@ def tally_bar(sent: SentFrames, pairs: Iterable[tuple[FrameRow, int]]) -> list[t
 
 
 def statistics_of(
-    frames: Iterable[FrameRow],
+    frames: Sequence[FrameRow],
     truth: Truth,
     *,
     events: int = 0,
@@ -72,7 +72,6 @@ def statistics_of(
 
     `others` are tallies of messages and positions; `links` are the receiver's by name, if it has several.
     """
-    frames = list(frames)
     matched = match_frames(frames, truth, links=links)
     tallies = list(others)
     for sent, pairs in zip(matched.bars, matched.pairs, strict=True):
@@ -87,9 +86,8 @@ def statistics_of(
     )
 
 
-def count_without_truth(frames: Iterable[FrameRow], packets: int) -> Statistics:
+def count_without_truth(frames: Sequence[FrameRow], packets: int) -> Statistics:
     """Count decoded frames without a truth."""
-    frames = list(frames)
     direct = [frame for frame in frames if frame.echo_of is None]
     sigmas = [to_nm(f.sigma_m) for f in direct if not (math.isnan(f.distance_m) or math.isnan(f.sigma_m))]
     return Statistics(

@@ -5,7 +5,7 @@ bits wrong. The road score leaves out declared reflections; a symbol that is not
 and one of a hidden cluster is claimed.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +29,15 @@ _ROAD_FIGURES = ("erased", "claimed", "bias_m", "worst_m", "nees")
 
 
 def score_frames(
-    frames: Iterable[FrameRow], truth: Truth, links: Mapping[str, Link] | None = None
+    frames: Sequence[FrameRow], truth: Truth, links: Mapping[str, Link] | None = None
 ) -> dict[str, Any]:
     """Both scores as JSON values: the plain one's keys, and the road score under `road`."""
-    frames = list(frames)
     plain, road = (_score_bars(frames, truth, links, road=road) for road in (False, True))
     return plain | {"road": road}
 
 
 def _score_bars(
-    frames: list[FrameRow], truth: Truth, links: Mapping[str, Link] | None, *, road: bool
+    frames: Sequence[FrameRow], truth: Truth, links: Mapping[str, Link] | None, *, road: bool
 ) -> dict[str, Any]:
     found = match_frames(frames, truth, road=road, links=links)
     bars = []

@@ -269,10 +269,9 @@ def verdict_of(ours: Figure, reference: Reference) -> Verdict:
 
 
 def compare_with_paper(
-    series: Iterable[Series], references: Iterable[Reference] = PAPER
+    series: Sequence[Series], references: Iterable[Reference] = PAPER
 ) -> list[PaperComparison]:
     """Compare each figure of the paper with every series that it applies to and that has data."""
-    series = list(series)
     comparisons = []
     for reference in references:
         for one in series:
