@@ -239,7 +239,7 @@ def count_missing_codewords(one: TransmitterTally, link: Link) -> int:
     """
     codewords = link.codebook.data_symbols
     missing = codewords - sum(symbol < codewords for symbol in one.symbol_counts)
-    if not one.symbols_given or not missing or (link.characters_on_air and not one.blocks):
+    if not one.symbols_given or (link.characters_on_air and not one.blocks):
         return 0
     if missing == codewords:
         return missing

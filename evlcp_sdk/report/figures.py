@@ -111,7 +111,7 @@ def draw_regions(kept: Figures, title: str) -> Figure:
     figure = Figure(figsize=(8, 4.8), layout="constrained")
     axis = figure.subplots()
     height, width = kept.image.shape
-    top = max(float(np.quantile(kept.image[kept.image > 0], 0.99)) if kept.image.any() else 1.0, 1.0)
+    top = float(np.quantile(kept.image[kept.image > 0], 0.99)) if kept.image.any() else 1.0
     shades = np.log1p(kept.image, dtype=np.float32)
     # Coloured here, in bytes: Matplotlib would take 80 MB for it.
     picture = colormaps["Greys"](np.clip(shades / np.float32(math.log1p(top)), 0, 1), bytes=True)

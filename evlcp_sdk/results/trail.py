@@ -20,7 +20,7 @@ class Trail:
         """The lines of the next places, of two points or more, none across the 180th meridian."""
         complete, line = [], self._end
         for fix in settled:
-            if fix.filtered.starts and line:
+            if fix.filtered.starts:
                 complete.append(line)
                 line = []
             place = fix.smoothed

@@ -297,11 +297,10 @@ def _make_cases(
         faults.append(f"{path}: {kind}: {count} cases of grid and variants, expected at most {_MAX_CASES}")
     if faults:
         return []
-    base = grid.base
     cases = []
     for name, variant in (grid.variants or {"": {}}).items():
         variant = _flatten(variant)
-        case_base = variant.pop("base", base)
+        case_base = variant.pop("base", grid.base)
         for values in itertools.product(*axes.values()):
             chosen = dict(zip(axes, values, strict=True))
             settings = fixed | chosen | variant
