@@ -99,8 +99,7 @@ def _flush_stdout() -> bool:
         _drop_stdout()
         return False
     except ValueError:
-        # It is closed.
-        return True
+        pass  # It is closed.
     return True
 
 
