@@ -65,8 +65,7 @@ class PulseClock:
         """
         rising = triggers.value == 1
         pulses = rising & (triggers.channel == self.channel)
-        if pulses.sum() < rising.sum():
-            self.other_channels |= set(triggers.channel[rising & ~pulses].tolist())
+        self.other_channels |= set(triggers.channel[rising & ~pulses].tolist())
         near_s = now_s - now_us * 1e-6 if self._near_s is None else self._near_s
         if self._approximate_s is None:
             self._approximate_s = near_s
@@ -123,10 +122,8 @@ class PulseClock:
         if last < 0:
             return None if self._approximate_s is None else self._approximate_s + t_us * 1e-6
         s_per_us = 1e-6
-        if last:
-            span_us = self._t_us[last] - self._t_us[last - 1]
-            if _whole_seconds(span_us):
-                s_per_us = (self._s[last] - self._s[last - 1]) / span_us
+        if last and _whole_seconds(self._t_us[last] - self._t_us[last - 1]):
+            s_per_us = (self._s[last] - self._s[last - 1]) / (self._t_us[last] - self._t_us[last - 1])
         return self._s[last] + (t_us - self._t_us[last]) * s_per_us
 
     @property
