@@ -69,9 +69,8 @@ class TrackPoses:
         selected: set[float] = set()
         for number in self._find_new_bars():
             times = [t for t in self._poses if self._is_in_view(number, t)]
-            if times:
-                rows = np.linspace(0, len(times) - 1, min(len(times), _MAX_POSES))
-                selected |= {times[row] for row in rows.round().astype(int).tolist()}
+            rows = np.linspace(0, len(times) - 1, min(len(times), _MAX_POSES))
+            selected |= {times[row] for row in rows.round().astype(int).tolist()}
         return [self._poses[t] for t in sorted(selected)]
 
     @property
