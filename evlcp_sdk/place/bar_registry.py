@@ -103,7 +103,7 @@ class BarRegistry:
             if received.trust == "forged":
                 self.forged += 1
                 state.trust, state.beacon = "forged", None
-            if received.beacon is None or received.trust == "forged":
+            if received.beacon is None:
                 continue
             if (
                 state.trust == "verified"

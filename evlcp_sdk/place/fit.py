@@ -179,7 +179,7 @@ def solve_three_points(enu_m: Floats, directions: Floats) -> list[tuple[Floats, 
             in_camera = math.sqrt(b2 / square) * np.array([[1.0], [u], [v]]) * directions
             rotation = _triangle_axes(enu_m).T @ _triangle_axes(in_camera)
             poses.append((enu_m.mean(0) - rotation @ in_camera.mean(0), rotation))
-    return poses[:_MAX_STARTS]
+    return poses
 
 
 def _triangle_axes(points: Floats) -> Floats:

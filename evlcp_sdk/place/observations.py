@@ -288,7 +288,7 @@ class Problem:
     @property
     def freedom(self) -> int:
         """Degrees of freedom; every shared error has an observation of its own, that it is about 0."""
-        return max(2 * len(self.points) + self.angles.known - 6, 1)
+        return 2 * len(self.points) + self.angles.known - 6
 
     def with_attitude(self, attitude: Attitude | None) -> "Problem | Rejection":
         """The same with another attitude, or why that is too little."""

@@ -212,7 +212,7 @@ def _shape_scatter(t: Floats, shapes: Floats, sigma: Floats) -> tuple[float, flo
     `sigma` their stated sigmas, px, (n, k).
     """
     n, count = shapes.shape[:2]
-    if n < 3 or count <= _SHAPE_MODES:
+    if count <= _SHAPE_MODES:
         return 1.0, 1.0
     line = np.stack([np.ones(n), t], 1) @ _line_weights(t)
     residual = shapes - np.einsum("nm,mjk->njk", line, shapes)

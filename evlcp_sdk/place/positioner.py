@@ -106,7 +106,7 @@ class Positioner:
     def close(self) -> list[Fix]:
         """End the stream; return the rest of the fixes."""
         last = max((f.points_t_us for kept in self._frames.values() for f in kept), default=-math.inf)
-        return self._compute_until(last / self._packet_us + 0.5) if math.isfinite(last) else []
+        return self._compute_until(last / self._packet_us + 0.5)
 
     def _compute_until(self, limit: float) -> list[Fix]:
         """Compute the fixes of the grid times up to a limit, in packet times."""
