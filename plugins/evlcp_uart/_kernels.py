@@ -228,21 +228,20 @@ def find_best_path(
         value, origin = idle[s] - after_idle, of_idle[s]
         for d in range(-near, near + 1):
             e = s - d
-            if 0 <= e < len(ended) and ended[e] > -np.inf:
+            if e >= 0:
                 follows = ended[e] - after_one - jitter * abs(d)
                 if follows > value:
                     value, origin = follows, e - length
             e -= pause
-            if pause and e >= 0 and ended[e] > -np.inf:
+            if pause and e >= 0:
                 follows = ended[e] + tails[e] - after_pause - jitter * abs(d)
                 if follows > value:
                     value, origin = follows, e - length
         value += scores[s]
-        if value > ended[s + length]:
-            ended[s + length] = value
-            before[s] = origin
-            if value > best:
-                best, best_end = value, s
+        ended[s + length] = value
+        before[s] = origin
+        if value > best:
+            best, best_end = value, s
     starts = np.empty(n, np.int64)
     k = 0
     at = best_end

@@ -66,10 +66,8 @@ class Characters:
             return np.zeros(len(evidence), np.bool_)
         other = self.levels()
         other[:, 1 + self.data_bits] ^= 1
-        right = self.likelihoods(evidence).max(1, initial=-np.inf)
-        wrong: NDArray[np.bool_] = (
-            _sum_evidence(evidence, _find_contexts(other)).max(1, initial=-np.inf) > right
-        )
+        right = self.likelihoods(evidence).max(1)
+        wrong: NDArray[np.bool_] = _sum_evidence(evidence, _find_contexts(other)).max(1) > right
         return wrong
 
     def frame_evidence(self, evidence: Floats) -> Floats:
@@ -103,7 +101,7 @@ class Characters:
             The likeliest characters, int64 (n,); LLRs ln P(0) / P(1) of their data bits, most significant
             first, float32 (n, data_bits); and the probability that the character is right, float64 (n,).
         """
-        top = likelihoods.max(1, initial=-np.inf, keepdims=True)
+        top = likelihoods.max(1, keepdims=True)
         weights = np.exp(likelihoods - top)
         total = weights.sum(1)
         ones = (np.arange(1 << self.data_bits)[:, None] >> np.arange(self.data_bits - 1, -1, -1)) & 1

@@ -248,5 +248,5 @@ def log_sum_exp(logs: Floats) -> Floats:
 
 def _normalize_likelihoods(logs: Floats) -> Floats:
     """Return likelihoods from their logarithms, the greatest of each window 1, float64 (n, C)."""
-    likely: Floats = np.exp(logs - logs.max(1, initial=-np.inf, keepdims=True))
+    likely: Floats = np.exp(logs - logs.max(1, keepdims=True))
     return likely
