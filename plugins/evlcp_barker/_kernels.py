@@ -113,9 +113,8 @@ def find_peaks(
             known = min(known + 1, memory)
             power += (value**2 - power) / known
         square = max(power if 2 * known >= memory else np.inf, 1 / max(seen, 1.0))
-        if at + span < counts.shape[1]:
-            for kind in range(2):
-                seen += counts[kind, at + span] - counts[kind, at]
+        for kind in range(2):
+            seen += counts[kind, at + span] - counts[kind, at]
         if value >= least / 2 and value >= min(outstands * np.sqrt(square), least):
             best = max(at - guard, 0)
             for near in range(best, min(at + guard + 1, rho.size)):
