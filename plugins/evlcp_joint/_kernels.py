@@ -405,7 +405,6 @@ def solve_fit(
     move, new_fit = np.empty(PARAMETERS), np.empty(PARAMETERS)
     cost, normal, right = build_equations(steps, seen, profile, lens, fit)
     damping = 1e-3
-    outside = False
     for _ in range(_MAX_STEPS):
         if not factor_cholesky(normal, damping, ROUNDING_SHARE, scale, factor):
             return False, normal
@@ -549,7 +548,6 @@ def fit_bar(
     by_boundary, rejected = np.empty((3, clusters + 1)), np.zeros(clusters + 1)
     by_value, scores = np.empty((2, n)), np.empty((values.shape[1], PARAMETERS))
     motion_so_far, own_motion, sizes = motion.copy(), np.zeros(n), np.empty(clusters + 1)
-    residual_squares, squares = 0.0, 0.0
     for rounds_left in range(_ROUNDS, -1, -1):
         reach = PROFILE_REACH * lens[0] * exp(fit[4])
         steps, rows = list_steps(codes, known, motion_so_far, reach, fit, values)
