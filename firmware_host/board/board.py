@@ -378,8 +378,7 @@ class Board:
             self.check_duty("a pause of this link", 1000, min(1.0, share))
         self.prepare_commit(like)
         bank = 1 if status.active_bank == 0 else 0
-        if like.content:
-            self.write_missing(bank, like.content)
+        self.write_missing(bank, like.content)
         slots = self.session.call(protocol.StreamRequest(bank, like.format, like.digest)).slots
         if ahead >= slots:
             self.stop()

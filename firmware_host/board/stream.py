@@ -251,11 +251,7 @@ class Stream:
     def _earliest_send_s(self, number: int, ahead: int) -> float:
         """Earliest time to send a packet so that at most `ahead` are on the board, s."""
         missing = number - ahead + 2 - self.begun
-        return (
-            self._blocked_until_s
-            if missing <= 0
-            else max(self._blocked_until_s, self._begun_s + missing * self.packet_s)
-        )
+        return max(self._blocked_until_s, self._begun_s + missing * self.packet_s)
 
     def _exchange(self, wait_s: float) -> None:
         """Send all pieces that are due, and read for at most `wait_s`."""
