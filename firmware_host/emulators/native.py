@@ -46,7 +46,7 @@ class NativeBoard(Transport):
                 if len(held) != len(self._saved_flash):
                     raise InputError(f"{flash}: not a flash file of {len(self._saved_flash)} bytes")
                 self._device.replace_flash(held)
-            self._save_flash(self._device.read_flash())  # raises now if SAVE could not write it
+            self._save_flash(flash.resolve(), self._device.read_flash())  # raises now if SAVE could not
         with writing(leds or ""):
             self._leds = None if leds is None else leds.open("wb")
         self._start_s = self.time_s()
@@ -75,7 +75,7 @@ class NativeBoard(Transport):
     def _write_files(self) -> None:
         # The slots are in the file before the answer to a SAVE is sent.
         if self._flash is not None and (held := self._device.read_flash()) != self._saved_flash:
-            self._save_flash(held)
+            self._save_flash(self._flash, held)
         records = self._device.take_raw_records()
         if self._leds is not None:
             with writing(self._leds.name):
@@ -88,17 +88,16 @@ class NativeBoard(Transport):
             with writing(self._leds.name):
                 self._leds.close()
 
-    def _save_flash(self, held: bytes) -> None:
+    def _save_flash(self, flash: Path, held: bytes) -> None:
         """Replace the flash file when the new one is complete; a symbolic link stays.
 
         It may hold a key: it keeps the permissions of the old one, and a new one is for its owner alone.
         """
-        if self._flash is not None:
-            with Outputs() as outputs, writing(self._flash):
-                mode = stat.S_IMODE(self._flash.stat().st_mode) if self._flash.exists() else 0o600
-                file = outputs.open_binary(self._flash)
-                os.fchmod(file.fileno(), mode)
-                file.write(held)
+        with Outputs() as outputs, writing(flash):
+            mode = stat.S_IMODE(flash.stat().st_mode) if flash.exists() else 0o600
+            file = outputs.open_binary(flash)
+            os.fchmod(file.fileno(), mode)
+            file.write(held)
         self._saved_flash = held
 
 
