@@ -130,7 +130,7 @@ def _list_depth(table: Any) -> int:
     depth = 0
     while isinstance(table, list) and table and depth < 3:
         depth, table = depth + 1, table[0]
-    return max(1, depth) if depth else 3
+    return depth or 3
 
 
 def _read_lines(file: Path) -> Iterator[str | None]:

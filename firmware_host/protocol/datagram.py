@@ -91,9 +91,8 @@ class DatagramDecoder:
         *ended, rest = data.split(b"\0")
         for part in ended:
             self._partial += part
-            if self._partial:
-                with contextlib.suppress(DatagramError):
-                    found.append(Datagram.decode(bytes(self._partial)))
+            with contextlib.suppress(DatagramError):
+                found.append(Datagram.decode(bytes(self._partial)))
             self._partial.clear()
         self._partial += rest
         # No datagram is so long, whatever else comes.
