@@ -68,9 +68,7 @@ class DetectorTracker(RegionTracker):
             elif len(self.alive) < self._limits.regions:
                 pieces = deque((begun_us, _select_inside(before, place)) for begun_us, before in self._recent)
                 first_us = pieces[0][0] if pieces else start_us
-                region = TrackedRegion(id, RegionTrack([place]), first_us, pieces)
-                region.opened_us = start_us + self._step_us
-                self.alive.append(region)
+                self.alive.append(TrackedRegion(id, RegionTrack([place]), first_us, pieces))
             else:
                 self.counts["regions_left_out"] += 1
         for region in self.alive:

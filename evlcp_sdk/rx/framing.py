@@ -199,7 +199,6 @@ class PacketFramer(Framer):
 
     def step(self, regions: list[TrackedRegion], step: TimeStep) -> None:
         """Synchronize with the regions of a time step and decode their frames."""
-        self._dropped.clear()
         # A frame may show another image of its bar: that is a region, too, and decoded at once.
         self._due = deque(regions)
         while self._due:
@@ -236,7 +235,6 @@ class PacketFramer(Framer):
         if self._follower is None:
             return
         self.apply_pending(step.start_us)
-        self._due.clear()
         until_us = step.end_us - self._tail_us
         alive = self._transmitters.alive.values()
         due = [one for one in alive if one.grid.next_due(until_us) is not None and _can_decode_early(one)]
