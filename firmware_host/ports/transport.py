@@ -87,7 +87,6 @@ class SocketTransport(Transport):
     def __init__(self, name: str, connected: socket.socket) -> None:
         self.name = name
         self._socket = connected
-        self._socket.settimeout(None)
 
     @classmethod
     def connect(cls, spec: str) -> "SocketTransport":
