@@ -143,7 +143,6 @@ class Session:
         """
         self.client.session = protocol.NO_SESSION
         self.client.sealer, old_sealer = None, self.client.sealer
-        self.client.window = 1
         self.client.minor = MINOR
         found: list[RequestOutcome] = []
         request = protocol.HelloRequest(MAJOR, MINOR, self._nonce)
