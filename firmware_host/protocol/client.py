@@ -187,6 +187,7 @@ class Client:
         """Drop all requests, queued or in flight; late answers will be ignored."""
         self._queue.clear()
         self._in_flight.clear()
+        self._outcomes.clear()
 
     def receive(self, data: bytes, time_s: float | None = None) -> list[RequestOutcome]:
         """Take bytes that were received at a time, s; return the outcomes of requests."""
