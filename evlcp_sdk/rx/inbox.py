@@ -241,10 +241,9 @@ class MessageAssembler:
             known.delivered = TrustVerdict("unverified", "undecodable")
             return []
         beacon = value if message.kind == Kind.BEACON else None
-        verdict, now_s = TrustVerdict("unverified", "not signed"), None
-        if message.kind in (Kind.BEACON, Kind.TIME):
-            zero = clock_zero_at(self._clock_zero, packet.t_us)
-            now_s = None if zero is None else zero.timestamp() + packet.t_us * 1e-6
+        verdict = TrustVerdict("unverified", "not signed")
+        zero = clock_zero_at(self._clock_zero, packet.t_us)
+        now_s = None if zero is None else zero.timestamp() + packet.t_us * 1e-6
         if beacon is not None:
             signed = inbox.complete.get((transmitter_id, Kind.SIGNATURE, sequence))
             signature = None
