@@ -171,7 +171,6 @@ class MessageAssembler:
         llr = np.zeros((packet.sent, self._coder.bits // packet.sent), np.float32)
         for frame in packet.frames:
             llr[frame.frame] = frame.soft.llr.ravel()
-        llr[np.isnan(llr)] = 0
         magnitude = np.minimum(np.abs(llr) ** _LLR_POWER, _MAX_LLR)
         return np.copysign(magnitude, llr).ravel()
 
