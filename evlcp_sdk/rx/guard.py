@@ -53,11 +53,10 @@ class Guard:
     """
 
     def __init__(self, link: Link, role: str, *, may_refuse: bool = False) -> None:
-        id = link.table[role]["id"]
         # An algorithm may not exit; a user may interrupt.
-        allowed: list[type[BaseException]] = [PluginError, KeyboardInterrupt]
-        self._allowed = (*allowed, ConfigError) if may_refuse else tuple(allowed)
-        self._role, self._id = role, id
+        allowed: tuple[type[BaseException], ...] = PluginError, KeyboardInterrupt
+        self._allowed = (*allowed, ConfigError) if may_refuse else allowed
+        self._role, self._id = role, link.table[role]["id"]
         self.checks = role not in link.built_in
 
     def __enter__(self) -> None:

@@ -183,7 +183,6 @@ class RomLoader:
 
 class _FailedError(Exception):
     def __init__(self, silent: bool) -> None:
-        super().__init__()
         self.silent = silent
 
 
