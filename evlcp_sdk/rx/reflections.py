@@ -421,7 +421,8 @@ class ReflectionQueue:
 
     def step(self) -> list[Packet]:
         """End a time step; return the packets that are complete with the frames of the step before."""
-        self.reflections.add_detections(found for _, found in self._new if found is not None)
+        if self._new:
+            self.reflections.add_detections(found for _, found in self._new if found is not None)
         due, self._old, self._new = self._old, self._new, []
         return [packet for assembler, found in due for packet in self._emit_packets(assembler, found)]
 
