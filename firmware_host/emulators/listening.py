@@ -111,10 +111,7 @@ class HostLine:
         return b""
 
     def _accept_host(self, server: socket.socket) -> None:
-        hung_up = select.poll()
-        if self._host is not None:
-            hung_up.register(self._host, select.POLLRDHUP)
-        if hung_up.poll(0):
+        if self._host is not None and _has_left(self._host):
             return  # all that it has sent is read first
         found, _ = server.accept()
         if self._host is not None:
@@ -132,3 +129,9 @@ class HostLine:
         """Stop listening, and remove the socket or the link."""
         self._hang_up()
         self._closing.close()
+
+
+def _has_left(host: int) -> bool:
+    poll = select.poll()
+    poll.register(host, select.POLLRDHUP)
+    return bool(poll.poll(0))
