@@ -113,6 +113,11 @@ def test_receive_writes_and_tells(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) 
     assert table["configuration"]["ranging"]["id"] == "joint-scale"
 
 
+def test_no_transmitter_is_no_failure(evlcp: Evlcp, noise_raw: Path, tmp_path: Path) -> None:
+    done = evlcp("receive", noise_raw, "-o", tmp_path / "out")
+    assert (done.code, "noise.raw: no transmitter was found" in done.out) == (0, True)
+
+
 def test_a_recording_of_which_much_is_dropped_is_degraded(evlcp, noise_raw, tmp_path) -> None:
     data = noise_raw.read_bytes()
     middle = data.index(b"% end\n") + 6 + len(data) // 4 * 2
