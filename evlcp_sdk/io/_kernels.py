@@ -2,7 +2,8 @@
 
 Indices that advance in a loop are `uintp`: numba then leaves out its test for negative indices. A word has
 `size` bytes, and its type in the top 4 bits, which is 8 for TIME_HIGH in every encoding; `at` is the byte
-offset of words[0]. If words are not `final`, a result of -1 asks for more of them.
+offset of words[0]. In EVT2.1 `stride` words, two, go together, else one. If words are not `final`, a result
+of -1 asks for more of them.
 """
 
 from typing import Any, Final

@@ -69,13 +69,13 @@ class Codec:
         word: Type of a word, little-endian.
         stride: Words that go together: 2 in EVT2.1, else 1.
         head: Which of these has the type.
-        burst: Room for events without which decoding stops: those of one word.
+        burst: Room for events without which decoding stops: at least those of one word.
         types: Bit mask of the word types that exist; a type is the top 4 bits of a word.
         channels: Trigger inputs that a word can name.
         time_bits: Bits of TIME_HIGH, and of the time below it.
         rollover: Words that roll the clock over once, to 0, in steps that a decoder accepts.
         decoder: The decoding kernel.
-        encoder: The encoding kernel.
+        encoder: The encoding kernel; of EVT2.1 it encodes to EVT2.
     """
 
     name: str
@@ -103,9 +103,7 @@ class Codec:
         # A third of the range at a time: a longer step would read as one back.
         third = len(self.rollover) // 5
         partial = self.rollover[: third * (3 * step >> high)] if rollovers else ()
-        words = np.zeros((len(self.rollover) * rollovers + len(partial), self.stride), self.word)
-        words[:, self.head] = self.rollover * rollovers + partial
-        return words.reshape(-1), (first_us >> low) - 1
+        return np.array(self.rollover * rollovers + partial, self.word), (first_us >> low) - 1
 
 
 def encode_evt2(
@@ -140,22 +138,11 @@ def encode_evt2(
     return n, i + rows - done, j + done
 
 
-def encode_evt21(
-    words: NDArray[np.uint32],
-    state: NDArray[np.int64],
-    events: _kernels.EventColumns,
-    i: int,
-    triggers: _kernels.TriggerColumns,
-    j: int,
-) -> tuple[int, int, int]:
-    """Encode to EVT2.1 words of an IMX636 as `encode_evt2` does, an event or trigger a pair."""
-    heads = np.empty(len(words) // 2, words.dtype)
-    n, i, j = encode_evt2(heads, state, events, i, triggers, j)
-    pairs, heads = words[: 2 * n].reshape(n, 2), heads[:n]
-    is_event = heads >> 28 <= _kernels.EVT2_CD_ON
-    pairs[:, 0] = np.where(is_event, heads & ~np.uint32(0x1F << 11), heads)
-    pairs[:, 1] = np.where(is_event, np.uint32(1) << (heads >> 11 & 0x1F), 0)
-    return 2 * n, i, j
+def add_columns(words: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    """Return words of EVT2 as EVT2.1 of an IMX636, uint32 (n, 2): behind each its column's bit of 32."""
+    is_event = words >> 28 <= _kernels.EVT2_CD_ON
+    first = np.where(is_event, words & ~np.uint32(0x1F << 11), words)
+    return np.stack([first, np.where(is_event, np.uint32(1) << (words >> 11 & 0x1F), np.uint32(0))], 1)
 
 
 EVT2: Final = Codec(
@@ -172,7 +159,7 @@ EVT2: Final = Codec(
 )
 """t = rollovers * 2^34 + TIME_HIGH * 2^6 + the event's own 6 bits, us."""
 
-EVT21: Final = replace(EVT2, name="EVT21", version="2.1", encoder=encode_evt21, stride=2)
+EVT21: Final = replace(EVT2, name="EVT21", version="2.1", stride=2)
 """EVT2.1 as an IMX636 sends it: behind each word of EVT2 one with a bit for each column from there on."""
 
 EVT21_LITTLE: Final = replace(EVT21, head=1)

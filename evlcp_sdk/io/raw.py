@@ -12,11 +12,22 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError, InputError, RawFormatError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.io import _kernels
-from evlcp_sdk.io.evt import EVT2, EVT3, EVT21, EVT21_LITTLE, MAX_SIDE, Codec, Decoder, EventBuffer
+from evlcp_sdk.io.evt import (
+    EVT2,
+    EVT3,
+    EVT21,
+    EVT21_LITTLE,
+    MAX_SIDE,
+    Codec,
+    Decoder,
+    EventBuffer,
+    add_columns,
+)
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.plugin.writer import EventWriter
 from evlcp_sdk.values import Events, Triggers, span_us, to_kernel_array
@@ -367,13 +378,16 @@ class RawEncoder:
         if not self._started and (len(events) or len(triggers)):
             self._started = True
             words, self._state[0] = self._codec.encode_prelude(span_us(events, triggers)[0])
-            yield words.tobytes()
+            yield self._to_bytes(words)
         event_columns = tuple(to_kernel_array(c) for c in (events.t_us, events.x, events.y, events.p))
         trigger_columns = tuple(to_kernel_array(c) for c in (triggers.t_us, triggers.channel, triggers.value))
         i = j = 0
         while i < len(events) or j < len(triggers):
             n, i, j = self._codec.encoder(self._words, self._state, event_columns, i, trigger_columns, j)
-            yield self._words[:n].tobytes()
+            yield self._to_bytes(self._words[:n])
+
+    def _to_bytes(self, words: NDArray[Any]) -> bytes:
+        return (words if self._codec.stride == 1 else add_columns(words)).tobytes()
 
 
 class RawWriter(EventWriter):
