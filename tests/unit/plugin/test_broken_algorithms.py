@@ -119,6 +119,7 @@ CASES: dict[tuple[str, str], tuple[Any, str]] = {
     ("framing", "gives fives"): (make_algorithm(Uart, compile=FIVES), "gave int, expected DecodedFrame"),
     ("detection", "gives fives"): (make_algorithm(Detection, compile=FIVES), "gave int, expected Region"),
     ("framing", "time is NaN"): (frames({"t_us": NAN}), "gave t_us = nan, expected a number from "),
+    ("framing", "LLR is NaN"): (frames({"llr": np.full((1, 8), NAN)}), "gave llr of other values, expected"),
     ("framing", "symbol is none"): (frames({"symbols": np.array([256])}), "gave symbol 256, expected"),
     ("framing", "frame is none"): (frames({"frame": 20}), "gave frame = 20, expected a number from 0 to 19"),
     ("framing", "goes back"): (frames({"packet": 3}, {"packet": 1}), "gave frame 0 of packet 1 behind"),
