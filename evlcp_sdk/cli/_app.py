@@ -213,7 +213,8 @@ def run() -> None:
         else:
             app, registry = make_app(), sdk.registry.Registry.load()
             strangers = add_plugin_commands(app, registry)
-        _prepare_command(group := typer.main.get_group(app))
+        group = typer.main.get_group(app)
+        _prepare_command(group)
         try:
             group(obj=registry)
         except Exception as fault:
